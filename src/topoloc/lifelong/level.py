@@ -1,8 +1,8 @@
-"""Give a map a world as robots expect it: z up, the floor at z = 0, metres (REP 103, REP 105).
+"""Level a map: find the floor in its points, which gives gravity and the height of the cameras, and
+move it to another world.
 
-Gravity comes from the floor, or from a named axis. The horizontal frame is that of the first
-mapping image, of its known pose, or of points that are known in another plan, such as the
-`map.yaml` of a robot. All poses of the map change, and no distance.
+A floor is the lowest large plane below the cameras. Tables are smaller or higher, and what lies
+below the floor (mirror images, wrong matches) is no plane.
 """
 
 from __future__ import annotations
@@ -16,98 +16,185 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import MapError, TrajectoryError
-from topoloc.geometry.alignment import align_points
-from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.json_data import OneLine
-from topoloc.lifelong.floor import Floor, find_floor
+from topoloc.errors import MapError
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.edit import WaitCallback, edit_map
-from topoloc.mapping.georeference import find_positions_by_name
-from topoloc.mapping.georeferencing import estimate_up_direction
 from topoloc.mapping.storage.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.topomap import Layer, TopoMetricMap
 from topoloc.node_ids import LazySequence
-from topoloc.recordings.text_files import read_rows
 
-_MIN_BASE = 0.5  # metres between two points of a plan
-_MAX_RESIDUAL_SHARE = 0.1
-_MIN_HORIZONTAL_NORM = math.sin(math.radians(10.0))
+_CELL = 0.25  # metres; a plane counts cells, so a textured table weighs no more than its area
+_MIN_CELLS = 12
+_MAX_DEPTH, _MAX_DISTANCE = 4.0, 8.0  # metres below a camera, and from it
+_MAX_TILT = math.radians(25.0)  # of a camera in the hand, on average over a walk
+_CAMERA_SIGMA = math.radians(10.0)
+_MAX_TILT_SIGMA = math.radians(1.5)
+_TOLERANCE = 0.03  # metres
+_NUM_SAMPLES, _NUM_STEPS = 400, 8
+_MIN_SHARE = 0.4
+"""A lower plane of at least this share of the largest one's cells is the floor."""
+_MIN_CONTRAST = 2.5
+"""A floor covers this many times the cells of a slab just below it. Seven maps (two corridors, a
+kitchen, two streets; a room and a shelf where no floor is seen): 3.2 and more, 1.4 and less."""
+_NO_FLOOR = (
+    "no floor is seen below the cameras; if an axis of the map points up, name it with --up and"
+    " give --camera-height, else give three points with heights: --points FILE"
+)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class LevelResult(OneLine):
-    """`new_from_old` transforms the world before to the level one. `tilt_deg` is the angle between
-    the old axis nearest to up and up. `floor` is None if the floor was not searched. `residuals_m`
-    are those of the plan's points."""
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """The plane ``up_world @ x = offset`` (metres) with the area that its points cover (m^2), their
+    median distance from it (m), and the sigma of its normal (radians, the weaker direction)."""
 
-    new_from_old: Rigid3
-    tilt_deg: float
-    camera_height_m: float
-    floor: Floor | None
-    residuals_m: Float[np.ndarray, " n"]
+    up_world: Float[np.ndarray, "3"]
+    offset: float
+    area_m2: float
+    residual_m: float
+    sigma_tilt: float
 
 
-def level_map(
-    path: str | Path,
-    pose: tuple[float, float, float] | None = None,
-    points: str | Path | None = None,
-    up: str | None = None,
-    camera_height: float | None = None,
-    on_wait: WaitCallback | None = None,
-) -> LevelResult:
-    """Give a map file a world with z up and the floor at z = 0, as one edit.
+def find_floor(topomap: TopoMetricMap, up_world: Float[np.ndarray, "3"] | None = None) -> Floor:
+    """Find the floor of the map.
 
     Args:
-        path: the map file, which is replaced.
-        pose: x, y (metres) and heading (degrees, counter-clockwise from x) of the first mapping
-            image in the new world. By default 0, 0, 0: x is where it looks.
-        points: a file of two or more points in both worlds, lines of `x, y, z, new x, new y` or
-            `image name, new x, new y` (metres; the camera's place), instead of `pose`. Three or
-            more with a new z after it determine gravity and the floor, too.
-        up: the axis of the map's world that is up exactly (`z`, `-y`). By default gravity is known
-            from the georeference, or found by the floor.
-        camera_height: median height of the mapping cameras above the floor (metres). By default the
-            floor is searched.
-        on_wait: called if another process edits the map, before this one waits.
+        up_world: the exact up direction, a unit vector, so that only the height is searched.
 
     Raises:
-        ValueError: both `pose` and `points` are given.
-        MapError: no floor is seen, the points do not determine the plan, or the map is missing,
-            damaged, or cannot be written.
+        MapError: no floor is seen, or too little to level the map by it.
     """
-    if pose is not None and points is not None:
-        raise ValueError("level takes one of pose and points")
-    with edit_map(path, on_wait) as edit:
-        topomap = edit.topomap
-        if not topomap.summaries:
-            raise MapError(f"map {path} has no mapping picture")
-        known = None if points is None else _read_plan(Path(points), topomap)
-        floor, residuals = None, np.zeros(0)
-        if known is not None and known.plan.shape[1] == 3:
-            with MapError.at(str(points), TrajectoryError):
-                new_from_old = align_points(known.plan, known.world)
-            residuals = _check_plan(known, new_from_old)
+    is_exact = up_world is not None
+    mean = -np.mean([one.world_from_cam.rotation[:, 1] for one in topomap.summaries], axis=0)
+    up = mean / np.linalg.norm(mean) if up_world is None else up_world
+    points = _points_below(topomap, up)
+    best = up if is_exact else _sample_normal(points, up)
+    offset, sigma, inside = _lowest_level(points, best), 0.0, points
+    for _ in range(_NUM_STEPS):
+        inside = points[np.abs(points @ best - offset) < _TOLERANCE]
+        if len(inside) == 0 or _num_cells(inside, best) < _MIN_CELLS:
+            raise MapError(_NO_FLOOR)
+        if is_exact:
+            offset = float(np.median(inside @ best))
         else:
-            with MapError.at(str(path)):
-                up_world, floor, offset = _find_vertical(topomap, up, camera_height)
-            upright = _upright_from_world(topomap, up_world, offset)
-            new_from_old = _plan_from_pose(*(pose or (0.0, 0.0, 0.0))) @ upright
-            if known is not None:
-                new_from_old = _fit_plan(known, upright) @ upright
-                residuals = _check_plan(known, new_from_old)
-        levelled = with_map_statistics(move_world(topomap, new_from_old))
-        edit.commit(levelled, "level", {"new_from_old": _to_text(new_from_old)})
-    nearest = estimate_up_direction([one.world_from_cam for one in topomap.summaries])
-    heights = [new_from_old.apply(one.world_from_cam.translation)[2] for one in topomap.summaries]
-    tilt = math.degrees(math.acos(min(1.0, float(new_from_old.rotation[2] @ nearest.world))))
-    return LevelResult(new_from_old, tilt, float(np.median(heights)), floor, residuals)
+            best, offset, sigma = _fit_plane(inside, up)
+    _check_contrast(points, best, offset)
+    residual = float(np.median(np.abs(inside @ best - offset)))
+    area = _CELL**2 * _num_cells(inside, best)
+    if sigma > _MAX_TILT_SIGMA:
+        raise MapError(
+            f"the floor is seen over {area:.1f} m2 only, which leaves its tilt open by"
+            f" {math.degrees(sigma):.1f} degrees; name the map's up axis, if one is exact: --up z"
+        )
+    return Floor(best, offset, area, residual, sigma)
 
 
-def _to_text(pose: Rigid3) -> str:
-    """Return x, y, z, qx, qy, qz, qw, as a line of a TUM file has them."""
-    w, *ijk = pose.quat_wxyz().tolist()
-    return " ".join(f"{number:.7g}" for number in (*pose.translation.tolist(), *ijk, w))
+def _points_below(
+    topomap: TopoMetricMap, up_world: Float[np.ndarray, "3"], max_points: int = 60_000
+) -> Float[np.ndarray, "n 3"]:
+    """Return points of the map below the cameras that see them, at most `max_points`."""
+    found = []
+    for node in topomap.nodes:
+        pose, points = node.summary.world_from_cam, node.points_cam.astype(float)
+        sigmas = np.sqrt((node.point_sqrt_covs.astype(float) ** 2).sum(axis=1))
+        world = pose.apply(points)
+        depth = (pose.translation - world) @ up_world
+        near = (depth > 0.05) & (depth < _MAX_DEPTH) & (sigmas < 2 * _TOLERANCE)
+        found.append(world[near & (np.linalg.norm(points, axis=1) < _MAX_DISTANCE)])
+    points = np.concatenate(found) if found else np.zeros((0, 3))
+    if len(points) < 3:
+        raise MapError(_NO_FLOOR)
+    return points[:: len(points) // max_points + 1]
+
+
+def _plane_axes(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:
+    """Return two unit vectors in the plane of this normal."""
+    return np.linalg.svd(normal[None])[2][1:].T
+
+
+def _num_cells(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "3"]) -> int:
+    cells = np.floor(points @ _plane_axes(normal) / _CELL).astype(np.int64)
+    return len(np.unique(cells[:, 0] * 1_000_003 + cells[:, 1]))
+
+
+def _sample_normal(
+    points: Float[np.ndarray, "n 3"], up_world: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """Return the normal of the plane through three points that covers most cells."""
+    rng, best, most = np.random.default_rng(0), up_world, 0
+    for _ in range(_NUM_SAMPLES):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 0.05:
+            continue
+        normal = normal * np.sign(normal @ up_world) / length
+        if normal @ up_world < math.cos(_MAX_TILT):
+            continue
+        num = _num_cells(points[np.abs((points - a) @ normal) < _TOLERANCE], normal)
+        if num > most:
+            best, most = normal, num
+    return best
+
+
+def _check_contrast(
+    points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "3"], offset: float
+) -> None:
+    """Check that the plane stands out from what lies below it. Raises MapError."""
+    heights = points @ normal - offset
+    num, below = (
+        _num_cells(points[np.abs(heights - centre) < _TOLERANCE], normal)
+        for centre in (0.0, -3.0 * _TOLERANCE)
+    )
+    if num < _MIN_CONTRAST * below:
+        raise MapError(_NO_FLOOR)
+
+
+def _lowest_level(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "3"]) -> float:
+    """Return the height of the lowest level with at least `_MIN_SHARE` of the most cells."""
+    heights = points @ normal
+    levels = np.arange(heights.min(), heights.max() + _TOLERANCE, _TOLERANCE)
+    cells = [_num_cells(points[np.abs(heights - one) < _TOLERANCE], normal) for one in levels]
+    first = int(np.flatnonzero(np.array(cells) >= _MIN_SHARE * max(cells))[0])
+    return float(levels[first + int(np.argmax(cells[first : first + 4]))])
+
+
+def _fit_plane(
+    points: Float[np.ndarray, "n 3"], up_world: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "3"], float, float]:
+    """Return the normal, the offset and the sigma of the tilt, with the cameras' up as a prior.
+    One point a cell counts: points of one thing err together."""
+    axes = _plane_axes(up_world)
+    flat = points @ axes
+    _, rows = np.unique(np.floor(flat / _CELL).astype(np.int64), axis=0, return_index=True)
+    flat, heights = flat[rows], (points @ up_world)[rows]
+    design = np.column_stack([flat, np.ones(len(flat))])
+    information = design.T @ design / (_TOLERANCE / 2) ** 2
+    information[:2, :2] += np.eye(2) / _CAMERA_SIGMA**2
+    slope_x, slope_y, offset = np.linalg.solve(
+        information, design.T @ heights / (_TOLERANCE / 2) ** 2
+    )
+    normal = up_world - axes @ np.array([slope_x, slope_y])
+    norm = float(np.linalg.norm(normal))
+    tilt = np.linalg.inv(information)[:2, :2]
+    return normal / norm, float(offset) / norm, math.sqrt(np.linalg.eigvalsh(tilt)[1])
+
+
+def move_map(
+    path: str | Path, new_from_old: Rigid3, name: str = "move", on_wait: WaitCallback | None = None
+) -> None:
+    """Move a map file to another world, as one edit of this name. The history keeps the transform
+    as x, y, z, qx, qy, qz, qw. Its place on earth stays.
+
+    Raises:
+        MapError: the map is missing, damaged, or cannot be written.
+    """
+    w, *ijk = new_from_old.quat_wxyz().tolist()
+    numbers = (*new_from_old.translation.tolist(), *ijk, w)
+    text = " ".join(f"{number:.7g}" for number in numbers)
+    with edit_map(path, on_wait) as edit:
+        moved = with_map_statistics(move_world(edit.topomap, new_from_old))
+        edit.commit(moved, name, {"new_from_old": text})
 
 
 def move_world(topomap: TopoMetricMap, new_from_old: Rigid3) -> TopoMetricMap:
@@ -162,109 +249,3 @@ def _move_sides(
     }
     summaries = [*map(move_summary, sides.summaries)]
     return replace(sides, summaries=summaries, nodes=move_nodes(sides.nodes), coarse_models=models)
-
-
-def _find_vertical(
-    topomap: TopoMetricMap, up: str | None, camera_height: float | None
-) -> tuple[Float[np.ndarray, "3"], Floor | None, float]:
-    """Return the up direction in the world, the floor if it was searched, and its height along
-    this direction. Raises MapError."""
-    known = None
-    if up is not None:
-        known = estimate_up_direction([], up).world
-    elif topomap.georeference is not None:
-        known = topomap.georeference.enu_from_world.rotation[2]
-    if known is not None and camera_height is not None:
-        heights = [one.world_from_cam.translation @ known for one in topomap.summaries]
-        return known, None, float(np.median(heights)) - camera_height
-    floor = find_floor(topomap, known, is_exact=known is not None)
-    offset = floor.offset
-    if camera_height is not None:
-        heights = [one.world_from_cam.translation @ floor.up_world for one in topomap.summaries]
-        offset = float(np.median(heights)) - camera_height
-    return floor.up_world, floor, offset
-
-
-def _upright_from_world(
-    topomap: TopoMetricMap, up_world: Float[np.ndarray, "3"], offset: float
-) -> Rigid3:
-    """Return the transform to axes with z up: x is the heading of the first mapping image, the
-    origin the point of the floor below it. Raises MapError: it looks up or down."""
-    first = topomap.summaries[0].world_from_cam
-    for direction in (first.rotation[:, 2], -first.rotation[:, 1]):
-        level = direction - (direction @ up_world) * up_world
-        if np.linalg.norm(level) >= _MIN_HORIZONTAL_NORM:
-            break
-    forward = level / np.linalg.norm(level)
-    rotation = np.array([forward, np.cross(up_world, forward), up_world])
-    height = first.translation @ up_world - offset
-    return Rigid3(rotation, np.array([0.0, 0.0, height]) - rotation @ first.translation)
-
-
-def _plan_from_pose(x: float, y: float, heading_deg: float) -> Rigid3:
-    turn = exp_so3(np.array([0.0, 0.0, math.radians(heading_deg)]))
-    return Rigid3(turn, np.array([x, y, 0.0]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Plan:
-    """Points of the world (n, 3) and of the plan (n, 2), or (n, 3) if heights are known. `path` is
-    their file."""
-
-    path: Path
-    world: Float[np.ndarray, "n 3"]
-    plan: Float[np.ndarray, "n d"]
-
-
-def _fit_plan(known: _Plan, upright_from_world: Rigid3) -> Rigid3:
-    """Return the turn about z and the shift from known points. Raises MapError."""
-    flat = upright_from_world.apply(known.world)[:, :2]
-    a, b = flat - flat.mean(axis=0), known.plan - known.plan.mean(axis=0)
-    base = 2.0 * float(np.linalg.norm(a, axis=1).max())
-    if base < _MIN_BASE:
-        raise MapError(f"{known.path}: the points are {base:.2f} m apart; take points metres apart")
-    sine, cosine = np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)
-    turn = exp_so3(np.array([0.0, 0.0, math.atan2(sine, cosine)]))
-    shift = known.plan.mean(axis=0) - turn[:2, :2] @ flat.mean(axis=0)
-    return Rigid3(turn, np.array([*shift, 0.0]))
-
-
-def _check_plan(known: _Plan, new_from_old: Rigid3) -> Float[np.ndarray, " n"]:
-    """Return the residuals of the points (metres). Raises MapError: they are too large."""
-    moved = new_from_old.apply(known.world)[:, : known.plan.shape[1]]
-    residuals = np.linalg.norm(moved - known.plan, axis=1)
-    extent = float(np.linalg.norm(known.plan - known.plan.mean(axis=0), axis=1).max())
-    if residuals.max() > _MAX_RESIDUAL_SHARE * extent:
-        worst = int(residuals.argmax())
-        raise MapError(
-            f"{known.path}: the points contradict each other by up to {residuals[worst]:.2f} m"
-            f" (point {worst + 1}): not the same places, x and y swapped, or a mirrored plan"
-        )
-    return residuals
-
-
-def _read_plan(path: Path, topomap: TopoMetricMap) -> _Plan:
-    """Read points of the world with their places in the plan. Raises MapError."""
-    positions, world, plan = find_positions_by_name(topomap), [], []
-    for line, columns in read_rows(path, MapError):
-        is_named = len(columns) < 5
-        try:
-            numbers = [float(text) for text in columns[is_named:]]
-        except ValueError:
-            numbers = []
-        if is_named and columns[0] not in positions:
-            raise MapError(f"{path}, line {line}: no mapping picture is named {columns[0][:60]!r}")
-        place = positions[columns[0]] if is_named else np.array(numbers[:3])
-        point = numbers if is_named else numbers[3:]
-        if len(point) not in (2, 3) or not np.isfinite(numbers).all():
-            raise MapError(
-                f"{path}, line {line}: `x, y, z, new x, new y` or `image name, new x, new y` is"
-                " needed"
-            )
-        world.append(place)
-        plan.append(point)
-    if len({len(point) for point in plan}) > 1:
-        raise MapError(f"{path}: all points have a new z, or none")
-    if len(plan) < len(plan[0]):
-        raise MapError(f"{path}: {len(plan)} of at least {len(plan[0])} points")
-    return _Plan(path, np.array(world), np.array(plan))

@@ -70,7 +70,7 @@ def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
         _parse_geo_point(path, line, _parse_numbers(path, line, columns[1:4]))
         for line, columns in rows
     ]
-    positions = find_positions_by_name(topomap)
+    positions = _find_positions_by_name(topomap)
     named = [
         (positions[columns[0]], place, columns[0])
         for (_, columns), place in zip(rows, places, strict=True)
@@ -116,7 +116,7 @@ def _interpolate_at_times(
     return ControlPoints.of(found)
 
 
-def find_positions_by_name(topomap: TopoMetricMap) -> dict[str, Float[np.ndarray, "3"]]:
+def _find_positions_by_name(topomap: TopoMetricMap) -> dict[str, Float[np.ndarray, "3"]]:
     """Return the positions of mapping images by full name, file name, and name with the recording.
     Ambiguous names are left out."""
     positions, twice = dict[str, np.ndarray](), set[str]()

@@ -136,5 +136,4 @@ def test_faults_have_one_line(own_map: Path, tmp_path: Path, complaint: Complain
     assert "one of --pose" in complaint(
         "level", own_map, "--pose", "1,2,3", "--points", plan, status=2
     )
-    assert "up is one of" in complaint("level", own_map, "--up", "q")
     assert "no floor is seen" in complaint("level", own_map, "--up=-z")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from topoloc import BuildConfig, TopoMetricMap, check_map, level_map
+from topoloc import BuildConfig, TopoMetricMap, check_map
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.mapping.map_jobs import (
     MapJob,
@@ -21,6 +21,7 @@ from topoloc.apps.cli.mapping.map_jobs import (
     split_recording,
 )
 from topoloc.apps.cli.maps.atlas import JoinedTiles, join_overlapping_tiles
+from topoloc.apps.cli.maps.level import find_and_move
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -151,7 +152,7 @@ class Command:
         is_replaced = target.is_file()
         topomap.save(target, print_waiting)
         if self.level:
-            level_map(target)
+            find_and_move(str(target))
             topomap = TopoMetricMap.load(target)
         if is_replaced:
             print_warning(f"{target} was there; `topoloc undo {target}` brings it back")

@@ -10,7 +10,7 @@ import pytest
 from hand_made import two_nodes
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.floor import find_floor
+from topoloc.lifelong.level import find_floor
 from topoloc.mapping.topomap import TopoMetricMap
 
 TILTED = Rigid3(exp_so3(np.array([0.9, -0.4, 0.3])), np.array([3.0, -2.0, 0.5]))
@@ -83,6 +83,6 @@ def test_an_exact_up_direction_needs_the_height_only():
     rng = np.random.default_rng(3)
     up = TILTED.rotation[:, 2]
     strip = area(rng, (0.1, 0.6, 0), (0.2, 5.5, 0), 200)
-    found = find_floor(place(strip), up, is_exact=True)
+    found = find_floor(place(strip), up)
     assert np.array_equal(found.up_world, up)
     assert abs(found.offset - TILTED.translation @ up) < 0.01
