@@ -71,8 +71,8 @@ if TYPE_CHECKING:
     from topoloc.geometry.rigid import Rigid3 as Rigid3
     from topoloc.geometry.uncalibrated_camera import UncalibratedCamera as UncalibratedCamera
     from topoloc.lifelong.growing import GrowingMap as GrowingMap, Growth as Growth
-    from topoloc.lifelong.level import move_map as move_map
     from topoloc.lifelong.merge import merge as merge
+    from topoloc.lifelong.move import move_map as move_map
     from topoloc.lifelong.prune import prune as prune
     from topoloc.lifelong.tiles.tile_joining import (
         PairResult as PairResult,
@@ -167,7 +167,7 @@ _NAMES = {
     "topoloc.geometry.rigid": "Rigid3",
     "topoloc.geometry.uncalibrated_camera": "UncalibratedCamera",
     "topoloc.lifelong.growing": "GrowingMap Growth",
-    "topoloc.lifelong.level": "move_map",
+    "topoloc.lifelong.move": "move_map",
     "topoloc.lifelong.merge": "merge",
     "topoloc.lifelong.prune": "prune",
     "topoloc.lifelong.tiles.tile_joining": "PairResult find_tile_of_recording join_tiles",

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     )
     from topoloc.geometry.alignment import align_points as align_points
     from topoloc.json_data import Finite as Finite, decode_json as decode_json
-    from topoloc.lifelong.level import find_floor as find_floor
     from topoloc.localization.query import Deadline as Deadline
     from topoloc.recordings.atomic import (
         atomic_write as atomic_write,
@@ -118,7 +117,6 @@ _NAMES = {
     "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.geometry.alignment": "align_points",
     "topoloc.json_data": "Finite decode_json",
-    "topoloc.lifelong.level": "find_floor",
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
         "atomic_write collect_written_paths remove_stale_files temporary_folder write_bytes"

@@ -41,8 +41,6 @@ from topoloc.slam.slam import run_slam
 
 _NUM_SHARED = 12
 """Frames that a piece shares with the last one."""
-_MAX_DRIFT, _MIN_DRIFT_M = 0.05, 0.3
-"""A pose in the map may differ from that by motion by this share of the way, or this much."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ class GrowingMap:
         stop = len(sequence) if stop is None else stop
         before, self._end = self._end, stop
         self._apart.append(_Piece(max(0, before - _NUM_SHARED), before, stop))
-        num_posed, shift = 0, 0.0
+        num_posed, shift, newest = 0, 0.0, self._world_from_cams
         while self._apart:  # the newest piece, then those before it, which share frames with it
             joined = self._join(sequence, self._apart[-1])
             if joined is None:
@@ -252,7 +250,7 @@ def _plausible(
 ) -> dict[int, Localization | None]:
     """Return the answers without those that are further from the poses by motion than its drift
     allows: similar places elsewhere."""
-    reach = max(_MIN_DRIFT_M, _MAX_DRIFT * way_m)
+    reach = max(0.3, 0.05 * way_m)  # metres; a share of the way
 
     def is_near(index: int, answer: Localization) -> bool:
         return answer.world_from_cam.is_same(by_motion[index], reach, np.deg2rad(15.0))

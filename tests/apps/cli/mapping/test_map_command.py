@@ -57,13 +57,17 @@ def errors_m(path: Path, world_from_map: Rigid3) -> list[float]:
 
 def test_walk_there_and_back(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out, facts_path = tmp_path / "room.topo", tmp_path / "facts.json"
-    assert main(["map", str(walk), str(out), *OPTIONS, "--json", str(facts_path)]) == 0
+    written = ("--level", "--json", str(facts_path))
+    assert main(["map", str(walk), str(out), *OPTIONS, *written]) == 0
     lines = capsys.readouterr().out.splitlines()
     sizes = [int(line.split(":")[1].split()[0]) for line in lines if " nodes, " in line]
     assert "107 frames, 0 without a pose" in lines[-2]
     assert 5 <= sizes[0] <= sizes[-1] <= sizes[0] + 3  # known walls become no new nodes
     assert find_map_damage(out) == []
-    assert np.median(errors_m(out, path_pose(0.0))) < 0.02
+    with TopoMetricMap.load(out) as topomap:  # the floor of this room is at z = -1.3
+        first = topomap.summaries[0].world_from_cam
+        assert abs(first.translation[2] - path_pose(0.0).translation[2] - 1.3) < 0.05
+    assert np.median(errors_m(out, path_pose(0.0) @ first.inverse())) < 0.02
     facts = json.loads(facts_path.read_text())
     assert facts["num_frames"] == 107
     assert facts["num_lost"] == 0

@@ -19,6 +19,7 @@ from topoloc import (
     open_sequence,
 )
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
+from topoloc.apps.cli.maps.level import find_and_move
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -54,6 +55,8 @@ class Command:
     """Replay a recording at the speed at which it was made."""
     piece: Annotated[int, tyro.conf.arg(metavar="FRAMES")] = 100
     """Frames after which the map is extended and written, at least."""
+    level: Flag = False
+    """At the end, give the map a world with z up and the floor at z = 0, see `topoloc level`."""
     format: Format = None
     camera: CameraOption = None
     topics: Topics = None
@@ -105,6 +108,8 @@ class Command:
                 f" mapped, pieces moved by at most {growing.max_shift_m:.3f} m"
             )
         growing.close()
+        if self.level:
+            find_and_move(self.map)
         write_json(self.json, facts)
         return 0
 

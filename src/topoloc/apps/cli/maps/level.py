@@ -18,6 +18,7 @@ import tyro
 from jaxtyping import Float
 
 from topoloc import MapError, Rigid3, TopoMetricMap, TrajectoryError, move_map
+from topoloc.apps.cli.maps.floor import find_floor
 from topoloc.apps.cli.output import (
     File,
     UsageError,
@@ -27,12 +28,9 @@ from topoloc.apps.cli.output import (
     print_waiting,
     write_json,
 )
-from topoloc.plugin import align_points, find_floor, read_text
+from topoloc.plugin import align_points, read_text
 
 _Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
-_MIN_BASE = 0.5  # metres between two points of a plan
-_MAX_RESIDUAL_SHARE = 0.1
-_MIN_HORIZONTAL_NORM = math.sin(math.radians(10.0))
 
 
 @dataclass(frozen=True)
@@ -205,11 +203,13 @@ def _upright_from_world(
     topomap: TopoMetricMap, up_world: Float[np.ndarray, "3"], offset: float
 ) -> Rigid3:
     """Return the transform to axes with z up: x is the heading of the first mapping image, the
-    origin the point of the floor below it. Raises MapError: it looks up or down."""
+    origin the point of the floor below it. If it looks up or down, x is its upper
+    side."""
+    min_norm = math.sin(math.radians(10.0))  # a camera that looks up or down has no heading
     first = topomap.summaries[0].world_from_cam
     for direction in (first.rotation[:, 2], -first.rotation[:, 1]):
         level = direction - (direction @ up_world) * up_world
-        if np.linalg.norm(level) >= _MIN_HORIZONTAL_NORM:
+        if np.linalg.norm(level) >= min_norm:
             break
     forward = level / np.linalg.norm(level)
     rotation = np.array([forward, np.cross(up_world, forward), up_world])
@@ -224,10 +224,11 @@ def _plan_from_pose(x: float, y: float, heading_deg: float) -> Rigid3:
 
 def _fit_plan(known: Plan, upright_from_world: Rigid3) -> Rigid3:
     """Return the turn about z and the shift from known points. Raises MapError."""
+    min_base = 0.5  # metres between two points
     flat = upright_from_world.apply(known.world)[:, :2]
     a, b = flat - flat.mean(axis=0), known.plan - known.plan.mean(axis=0)
     base = 2.0 * float(np.linalg.norm(a, axis=1).max())
-    if base < _MIN_BASE:
+    if base < min_base:
         raise MapError(f"{known.path}: the points are {base:.2f} m apart; take points metres apart")
     sine, cosine = np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)
     turn = Rigid3.exp(np.array([0.0] * 5 + [math.atan2(sine, cosine)])).rotation
@@ -237,10 +238,11 @@ def _fit_plan(known: Plan, upright_from_world: Rigid3) -> Rigid3:
 
 def _check_plan(known: Plan, new_from_old: Rigid3) -> Float[np.ndarray, " n"]:
     """Return the residuals of the points (metres). Raises MapError: they are too large."""
+    max_share = 0.1  # of the extent of the points
     moved = new_from_old.apply(known.world)[:, : known.plan.shape[1]]
     residuals = np.linalg.norm(moved - known.plan, axis=1)
     extent = float(np.linalg.norm(known.plan - known.plan.mean(axis=0), axis=1).max())
-    if residuals.max() > _MAX_RESIDUAL_SHARE * extent:
+    if residuals.max() > max_share * extent:
         worst = int(residuals.argmax())
         raise MapError(
             f"{known.path}: the points contradict each other by up to {residuals[worst]:.2f} m"

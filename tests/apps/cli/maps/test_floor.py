@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hand_made import two_nodes
+from topoloc.apps.cli.maps.floor import find_floor
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.level import find_floor
 from topoloc.mapping.topomap import TopoMetricMap
 
 TILTED = Rigid3(exp_so3(np.array([0.9, -0.4, 0.3])), np.array([3.0, -2.0, 0.5]))
