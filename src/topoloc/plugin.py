@@ -36,7 +36,6 @@ if TYPE_CHECKING:
         NetworkInfo as NetworkInfo,
         cache_folder as cache_folder,
     )
-    from topoloc.geometry.alignment import align_points as align_points
     from topoloc.json_data import Finite as Finite, decode_json as decode_json
     from topoloc.localization.query import Deadline as Deadline
     from topoloc.recordings.atomic import (
@@ -115,7 +114,6 @@ _NAMES = {
     ),
     "topoloc.features.features": "Features",
     "topoloc.features.network_files": "NetworkInfo cache_folder",
-    "topoloc.geometry.alignment": "align_points",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (

@@ -1,4 +1,4 @@
-"""The block in docs/benchmarks.md is what the stored results give; tables say what was not run, and
+"""The block in docs/journal/paper.md is what the stored results give; tables say what was not run, and
 hide no query."""
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def _row(method: str = "surf-vlad", nodes: str = "D_thresh 2 m", **more: Any) ->
     return row | errors | {"topological_accuracy": 0.9, "neighbour_accuracy": 1.0} | more
 
 
-def test_the_page_of_benchmarks_holds_what_the_stored_results_give():
-    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+def test_the_journal_holds_what_the_stored_results_give():
+    page = (ROOT / "docs" / "journal" / "paper.md").read_text(encoding="utf-8")
     assert block_of(json.loads(STORED.read_text(encoding="utf-8"))) in page
 
 

@@ -126,6 +126,7 @@ def test_faults_have_one_line(own_map: Path, tmp_path: Path, complaint: Complain
         "0,0,0,0,0\n3,0,0,3,0\n0,2,0,0,-2\n": "contradict each other",
         "nobody.png,1,2\n": "no mapping picture is named 'nobody.png'",
         "0,0,0,0,0,0,0\n": "is needed",
+        "0,0,0,0,0,0\n1,0,0,1,0,0\n2,0,0,2,0,0\n": "lie on one line",
         "0,0,0,0,0\n1,0,0,1,0,1\n": "all points have a new z, or none",
     }
     for rows, fault in text.items():

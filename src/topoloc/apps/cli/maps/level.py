@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from topoloc import MapError, Rigid3, TopoMetricMap, TrajectoryError, move_map
+from topoloc import MapError, Rigid3, TopoMetricMap, move_map
 from topoloc.apps.cli.maps.floor import find_floor
 from topoloc.apps.cli.output import (
     File,
@@ -28,7 +28,7 @@ from topoloc.apps.cli.output import (
     print_waiting,
     write_json,
 )
-from topoloc.plugin import align_points, read_text
+from topoloc.plugin import read_text
 
 _Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
@@ -160,8 +160,7 @@ def find_level_world(
     area = sigma = 0.0
     residuals = np.zeros(0)
     if known is not None and known.plan.shape[1] == 3:
-        with MapError.at(str(known.path), TrajectoryError):
-            new_from_old = align_points(known.plan, known.world)
+        new_from_old = _fit_points(known)
         residuals = _check_plan(known, new_from_old)
     else:
         up_world, offset, area, sigma = _find_vertical(topomap, up, camera_height)
@@ -234,6 +233,17 @@ def _fit_plan(known: Plan, upright_from_world: Rigid3) -> Rigid3:
     turn = Rigid3.exp(np.array([0.0] * 5 + [math.atan2(sine, cosine)])).rotation
     shift = known.plan.mean(axis=0) - turn[:2, :2] @ flat.mean(axis=0)
     return Rigid3(turn, np.array([*shift, 0.0]))
+
+
+def _fit_points(known: Plan) -> Rigid3:
+    """Return the rigid transform from points with heights (Umeyama, 1991). Raises MapError."""
+    centre_world, centre_plan = known.world.mean(axis=0), known.plan.mean(axis=0)
+    correlation = (known.plan - centre_plan).T @ (known.world - centre_world)
+    u, spread, vt = np.linalg.svd(correlation)
+    if spread[1] <= 1e-6 * max(spread[0], 1.0):
+        raise MapError(f"{known.path}: the points lie on one line, which leaves the tilt open")
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return Rigid3(rotation, centre_plan - rotation @ centre_world)
 
 
 def _check_plan(known: Plan, new_from_old: Rigid3) -> Float[np.ndarray, " n"]:
