@@ -7,7 +7,7 @@ import contextlib
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Collection, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from topoloc.apps.service import geopose_routes, map_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
+from topoloc.apps.service.cross_origin import CrossOrigin
 from topoloc.apps.service.logs import Metrics, log, log_json
 from topoloc.apps.service.query_handler import ImageDecoder, QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
@@ -41,9 +42,10 @@ def create_application(
     loopback_only: bool = True,
     tracking: TrackerConfig | None = None,
     atlas_config: AtlasConfig | None = None,
+    origins: Collection[str] = (),
 ) -> App:
     """Create the application. It closes the maps when it ends. See `RequestLimits` for `token` and
-    `loopback_only`."""
+    `loopback_only`; pages of `origins` may ask."""
     metrics = Metrics()
     atlases = ServedAtlases(maps, atlas_config or AtlasConfig())
     query_handler = QueryHandler(
@@ -81,7 +83,7 @@ def create_application(
     for kind in (RequestError, HTTPException, RequestValidationError, 404, 405):
         app.add_exception_handler(kind, _error_response)
     bounds = config.max_upload_bytes, config.upload_s
-    limits = RequestLimits(token, loopback_only, *bounds)
+    limits = RequestLimits(token, loopback_only, *bounds, CrossOrigin(origins))
     return AccessMiddleware(app, limits, metrics)
 
 
