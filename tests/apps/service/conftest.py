@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from running_service import LIMITS, Running, running
+from running_service import LIMITS, PAGE, TOKEN, Running, running
 
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -49,6 +49,23 @@ def service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ru
 @pytest.fixture(scope="session")
 def client(service: Running) -> Iterator[httpx.Client]:
     with service.client() as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def open_service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A service of the map `earth` with a token, for pages of two other origins too."""
+    token = tmp_path_factory.mktemp("token") / "token"
+    token.write_text(TOKEN)
+    origins = ("--allow-origin", PAGE, "--allow-origin", "http://localhost:3000")
+    with running(maps / "earth.topo", "--token-file", token, *origins) as service:
+        yield service
+
+
+@pytest.fixture(scope="session")
+def asked(open_service: Running) -> Iterator[httpx.Client]:
+    """Asks it with the token."""
+    with open_service.client(headers={"authorization": f"Bearer {TOKEN}"}) as client:
         yield client
 
 

@@ -18,6 +18,7 @@ import httpx
 
 ROOT = Path(__file__).parents[3]
 TOKEN = "a-token-of-some-length"
+PAGE = "https://client.example"
 LIMITS = (
     "[serve]\nmax_upload_mb = 3.0\nmax_megapixels = 4.0\nupload_s = 4.0\nmax_sessions ="
     " 4\nmax_sessions_per_address = 3\nsession_idle_s = 4.0\n"

@@ -5,18 +5,18 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import httpx
 import pytest
-from running_service import TOKEN, Running, running
+from running_service import PAGE, TOKEN, Running, running
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from topoloc.apps.service.cross_origin import parse_origin
 
-PAGE, OTHER = "https://client.example", "https://elsewhere.example"
+OTHER = "https://elsewhere.example"
 ALLOWS = "access-control-allow-origin"
 SESSIONS = "/v1/maps/earth/sessions"
 
@@ -24,21 +24,6 @@ SESSIONS = "/v1/maps/earth/sessions"
 def _preflight(client: httpx.Client, path: str, method: str, **headers: str) -> httpx.Response:
     asked = {"origin": PAGE, "access-control-request-method": method}
     return client.options(path, headers=asked | headers)
-
-
-@pytest.fixture(scope="module")
-def open_service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    token = tmp_path_factory.mktemp("token") / "token"
-    token.write_text(TOKEN)
-    shown = ("--allow-origin", PAGE, "--allow-origin", "http://localhost:3000")
-    with running(maps / "earth.topo", "--token-file", token, *shown) as service:
-        yield service
-
-
-@pytest.fixture(scope="module")
-def asked(open_service: Running) -> Iterator[httpx.Client]:
-    with open_service.client(headers={"authorization": f"Bearer {TOKEN}"}) as client:
-        yield client
 
 
 def test_a_page_of_an_allowed_origin_asks_by_the_geopose_protocol(

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Collection, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request
@@ -25,6 +26,7 @@ from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
 from topoloc.apps.service.cross_origin import CrossOrigin
 from topoloc.apps.service.logs import Metrics, log, log_json
+from topoloc.apps.service.openapi_schemas import complete_document
 from topoloc.apps.service.query_handler import ImageDecoder, QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, Streams, Workers
@@ -69,13 +71,15 @@ def create_application(
         await service.close()
         log("ended")
 
-    app = FastAPI(
+    app = _Application(
         title="topoloc",
         version=topoloc.__version__,
         description=_DESCRIPTION,
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        generate_unique_id_function=lambda route: route.name,
     )
     app.state.service = service
     for routes in (map_routes, geopose_routes, stream_routes):
@@ -85,6 +89,15 @@ def create_application(
     bounds = config.max_upload_bytes, config.upload_s
     limits = RequestLimits(token, loopback_only, *bounds, CrossOrigin(origins))
     return AccessMiddleware(app, limits, metrics)
+
+
+class _Application(FastAPI):
+    """The routes, and their document for generators of clients."""
+
+    def openapi(self) -> dict[str, Any]:
+        if self.openapi_schema is None:
+            self.openapi_schema = complete_document(super().openapi())
+        return self.openapi_schema
 
 
 async def _error_response(request: Request, error: Exception) -> Response:
