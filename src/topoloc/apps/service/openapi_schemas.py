@@ -179,10 +179,10 @@ def complete_document(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _result_schemas() -> dict[str, Any]:
-    """Return result.schema.json as named schemas. Two objects stand for its conditions, of which
-    generators of clients know nothing."""
+    """Return result.schema.json as named schemas. Two objects stand for its conditions, and a
+    boolean for its constant: generators of clients fail at these."""
     file = resources.files("topoloc.localization").joinpath("result.schema.json")
-    text = file.read_text(encoding="utf-8")
+    text = file.read_text(encoding="utf-8").replace('"const": false', '"type": "boolean"')
     for name in json.loads(text)["$defs"]:
         text = text.replace(f"#/$defs/{name}", _REFERENCE.format(model=_SCHEMA_NAMES[name]))
     whole = json.loads(text)
