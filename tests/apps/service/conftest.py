@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from running_service import LIMITS, PAGE, TOKEN, Running, running
+from running_service import LIMITS, PAGE, SIGNED_TOKEN, Running, running
 
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -56,7 +56,7 @@ def client(service: Running) -> Iterator[httpx.Client]:
 def open_service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A service of the map `earth` with a token, for pages of two other origins too."""
     token = tmp_path_factory.mktemp("token") / "token"
-    token.write_text(TOKEN)
+    token.write_text(SIGNED_TOKEN)
     origins = ("--allow-origin", PAGE, "--allow-origin", "http://localhost:3000")
     with running(maps / "earth.topo", "--token-file", token, *origins) as service:
         yield service
@@ -65,7 +65,7 @@ def open_service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 @pytest.fixture(scope="session")
 def asked(open_service: Running) -> Iterator[httpx.Client]:
     """Asks it with the token."""
-    with open_service.client(headers={"authorization": f"Bearer {TOKEN}"}) as client:
+    with open_service.client(headers={"authorization": f"Bearer {SIGNED_TOKEN}"}) as client:
         yield client
 
 

@@ -7,10 +7,11 @@ import base64
 import json
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import quote
 
 import httpx
 import pytest
-from running_service import PAGE, TOKEN, Running, running
+from running_service import PAGE, SIGNED_TOKEN, TOKEN, Running, running
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -105,7 +106,7 @@ def test_other_origins_are_refused_in_a_sentence_that_names_the_option(asked: ht
 
 def test_websockets_of_allowed_pages_are_accepted(open_service: Running):
     address = open_service.url.replace("http", "ws") + SESSIONS
-    spoken = ["topoloc", f"bearer.{TOKEN}"]
+    spoken = ["topoloc", f"bearer.{quote(SIGNED_TOKEN, safe='')}"]
     with connect(address, subprotocols=spoken, origin="http://localhost:3000") as stream:  # pyright: ignore[reportArgumentType]
         assert stream.subprotocol == "topoloc"
     with (

@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
+from urllib.parse import unquote
 
 from topoloc.apps.service.cross_origin import CrossOrigin
 from topoloc.apps.service.logs import Metrics, log
@@ -27,7 +28,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 BEARER_PROTOCOL = "bearer."
 """WebSockets of browsers cannot send headers. They name the subprotocols `topoloc` and this prefix
-with the token."""
+with the token, percent-encoded where it has signs that no subprotocol may have."""
 _PUBLIC_PATHS = ("/healthz", "/")
 _PUBLIC_FOLDERS = ("/static/",)
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -156,7 +157,7 @@ class _Request:
             return token.strip()
         offered = (one.strip() for one in self.header("sec-websocket-protocol").split(","))
         tokens = [one for one in offered if one.startswith(BEARER_PROTOCOL)]
-        return tokens[0].removeprefix(BEARER_PROTOCOL) if tokens else ""
+        return unquote(tokens[0].removeprefix(BEARER_PROTOCOL)) if tokens else ""
 
     @property
     def is_preflight(self) -> bool:
