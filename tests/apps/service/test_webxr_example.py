@@ -72,7 +72,7 @@ def browser() -> Iterator[Any]:
 
 
 class _Files(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
+    def log_message(self, format: str, *args: object) -> None:
         """Say nothing."""
 
 
