@@ -20,7 +20,7 @@ from fastapi.responses import JSONResponse, Response
 
 import topoloc
 from topoloc import AtlasConfig, Localizer, MapCache, TopolocError, TrackerConfig
-from topoloc.apps.service import geopose_routes, map_routes, stream_routes
+from topoloc.apps.service import discovery_routes, geopose_routes, map_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
@@ -82,7 +82,7 @@ def create_application(
         generate_unique_id_function=lambda route: route.name,
     )
     app.state.service = service
-    for routes in (map_routes, geopose_routes, stream_routes):
+    for routes in (map_routes, geopose_routes, stream_routes, discovery_routes):
         app.include_router(routes.router)
     for kind in (RequestError, HTTPException, RequestValidationError, 404, 405):
         app.add_exception_handler(kind, _error_response)

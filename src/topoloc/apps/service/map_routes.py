@@ -16,8 +16,10 @@ from pydantic import BaseModel
 
 import topoloc
 from topoloc import Camera
+from topoloc.apps.service.discovery_messages import SPATIALDDS
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
+    OBJECT_RESPONSE,
     PUBLIC,
     QUERY_ERRORS,
     QueryParameters,
@@ -49,9 +51,6 @@ _TYPES = {
     ".md": "text/plain",
 }
 _NUM_CACHED_SCENES = 4
-_MAP_RESPONSES = error_responses(401, 403, 404, 422, 429, 503) | {
-    200: {"content": {"application/json": {"schema": {"type": "object"}}}}
-}
 
 
 @router.get("/healthz", responses=error_responses(503), tags=["service"], openapi_extra=PUBLIC)
@@ -85,6 +84,7 @@ async def get_capabilities(request: Request) -> dict[str, Any]:
         "maps": service.maps.names(),
         "camera_models": Camera.model_names(),
         "geopose_protocol": ["1.0", "2.0"],
+        "spatialdds": [SPATIALDDS],
         "limits": {
             "megabytes": config.max_upload_mb,
             "megapixels": config.max_megapixels,
@@ -105,7 +105,11 @@ async def list_maps(request: Request) -> MapNames:
     return MapNames(maps=get_service(request).maps.names())
 
 
-@router.get("/v1/maps/{map}", responses=_MAP_RESPONSES, tags=["maps"])
+@router.get(
+    "/v1/maps/{map}",
+    responses=OBJECT_RESPONSE | error_responses(401, 403, 404, 422, 429, 503),
+    tags=["maps"],
+)
 async def get_map(request: Request, map: MapName) -> JSONResponse:
     """Return the facts of a map, as `topoloc info --json`, and its nodes with their poses."""
     service = get_service(request)
@@ -188,7 +192,11 @@ async def explain(request: Request, map: MapName, parameters: UrlParameters) -> 
     return HTMLResponse(text) if as_page else Response(text, media_type="application/json")
 
 
-@router.get("/v1/maps/{map}/scene", responses=_MAP_RESPONSES, tags=["maps"])
+@router.get(
+    "/v1/maps/{map}/scene",
+    responses=OBJECT_RESPONSE | error_responses(401, 403, 404, 422, 429, 503),
+    tags=["maps"],
+)
 async def get_scene(request: Request, map: MapName) -> Response:
     """Return a map for display: points, nodes with their images, and paths. See docs/viewer.md."""
     service, stop = get_service(request), threading.Event()

@@ -114,13 +114,17 @@ _TAGS = [
     {"name": "localization", "description": "Poses of single images."},
     {"name": "streams", "description": "Poses of successive images."},
     {"name": "geopose", "description": "The OSCP GeoPose Protocol."},
+    {"name": "discovery", "description": "Maps of a region, by SpatialDDS 1.6."},
     {"name": "maps", "description": "What maps hold."},
     {"name": "service", "description": "Health, features and counters."},
 ]
+OBJECT_RESPONSE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/json": {"schema": {"type": "object"}}}}
+}
 PUBLIC: dict[str, Any] = {"security": []}
 """Of a route that takes no token."""
 _ERROR_DESCRIPTIONS = {
-    400: "no image, a damaged image, or an unreadable form",
+    400: "an invalid request, no image or a damaged one, or an unreadable form",
     401: "the token is missing or wrong",
     403: "the request comes from a page of another site",
     404: "no such map or session",
