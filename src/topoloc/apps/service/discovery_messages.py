@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
@@ -29,15 +29,7 @@ SEARCH_EXAMPLE: dict[str, Any] = {
 Kind = Literal[
     "VPS", "MAPPING", "RELOCAL", "SEMANTICS", "STORAGE", "CONTENT", "ANCHOR_REGISTRY", "OTHER"
 ]
-Geohash = Annotated[str, Field(pattern=f"^[{_GEOHASH_DIGITS}]{{3,7}}$")]
-_Number = FiniteFloat
-_Corner = tuple[_Number, _Number, _Number]
-
-
-class FrameRef(BaseModel):
-    """A frame by its name. Those below `earth-fixed` are WGS-84."""
-
-    fqn: str = "earth-fixed"
+_Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class Bounds(BaseModel):
@@ -52,12 +44,12 @@ class CoverageElement(BaseModel):
 
     type: Literal["bbox", "volume"] = "bbox"
     crs: Literal["EPSG:4979", "EPSG:4326"] | None = None
-    bbox: tuple[_Number, _Number, _Number, _Number] | None = None
+    bbox: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
     has_bbox: bool = True
     aabb: Bounds | None = None
     has_aabb: bool = True
     everywhere: bool = Field(False, alias="global")
-    frame_ref: FrameRef | None = None
+    frame_ref: dict[str, Any] = {}
 
     @model_validator(mode="after")
     def _check(self) -> CoverageElement:
@@ -71,7 +63,7 @@ class CoverageElement(BaseModel):
     @property
     def is_on_earth(self) -> bool:
         """Whether its frame is the earth's."""
-        return self.frame_ref is None or self.frame_ref.fqn.split("/")[0] == "earth-fixed"
+        return str(self.frame_ref.get("fqn", "earth-fixed")).split("/")[0] == "earth-fixed"
 
     @property
     def box(self) -> Box | None:
@@ -83,21 +75,13 @@ class CoverageElement(BaseModel):
         return (*self.aabb.min_xyz[:2], *self.aabb.max_xyz[:2])
 
 
-class CoverageFilter(BaseModel):
-    """Only services with such topics. Empty lists match all."""
-
-    type_in: list[str] = []
-    qos_profile_in: list[str] = []
-    module_id_in: list[str] = []
-
-
 class SearchRequest(BaseModel):
     """A search by regions, a geohash or both."""
 
     coverage: list[CoverageElement] = []
-    geohash: Geohash | None = None
+    geohash: str | None = Field(None, pattern=f"^[{_GEOHASH_DIGITS}]{{3,7}}$")
     kind: list[Kind] = []
-    filter: CoverageFilter = CoverageFilter()
+    filter: dict[str, list[str]] = Field({}, description="topics of DDS that services must have")
     max_results: int = Field(100, ge=1)
     page_token: str = Field("", pattern="^[0-9]{0,9}$")
 
@@ -109,9 +93,7 @@ class SearchRequest(BaseModel):
 
     def matches(self, box: Box) -> bool:
         """Whether a service for images of this box is wanted. It has no topics of DDS."""
-        its_filter = self.filter
-        wants_topics = its_filter.type_in or its_filter.qos_profile_in or its_filter.module_id_in
-        if wants_topics or (self.kind and "VPS" not in self.kind):
+        if any(self.filter.values()) or (self.kind and "VPS" not in self.kind):
             return False
         wanted = [one.box for one in self.coverage if one.box is not None and one.is_on_earth]
         wanted += [] if self.geohash is None else [geohash_box(self.geohash)]

@@ -83,33 +83,6 @@ IMAGE_BODY: dict[str, Any] = {
     }
 }
 _REFERENCE = "#/components/schemas/{model}"
-_SCHEMA_NAMES = {
-    "pose": "Pose",
-    "covariance": "Covariance",
-    "camera": "Camera",
-    "geopose": "GeoPose",
-}
-_RESULT_OF_MAPS = {
-    "ResultOfMaps": {
-        "type": "object",
-        "description": "results of all maps; `map` is the only map with a pose, else null",
-        "required": ["query", "localized", "map", "answers"],
-        "properties": {
-            "query": {"type": "string"},
-            "localized": {"type": "boolean"},
-            "map": {"type": ["string", "null"]},
-            "answers": {"type": "array", "items": {"$ref": _REFERENCE.format(model="MapResult")}},
-        },
-    },
-    "MapResult": {
-        "type": "object",
-        "required": ["map", "result"],
-        "properties": {
-            "map": {"type": "string"},
-            "result": {"$ref": _REFERENCE.format(model="Result")},
-        },
-    },
-}
 _TAGS = [
     {"name": "localization", "description": "Poses of single images."},
     {"name": "streams", "description": "Poses of successive images."},
@@ -187,10 +160,11 @@ def _result_schemas() -> dict[str, Any]:
     boolean for its constant: generators of clients fail at these."""
     file = resources.files("topoloc.localization").joinpath("result.schema.json")
     text = file.read_text(encoding="utf-8").replace('"const": false', '"type": "boolean"')
-    for name in json.loads(text)["$defs"]:
-        text = text.replace(f"#/$defs/{name}", _REFERENCE.format(model=_SCHEMA_NAMES[name]))
+    names = {name: name.title().replace("pose", "Pose") for name in json.loads(text)["$defs"]}
+    for name, shown in names.items():
+        text = text.replace(f"#/$defs/{name}", _REFERENCE.format(model=shown))
     whole = json.loads(text)
-    schemas = {_SCHEMA_NAMES[name]: schema for name, schema in whole["$defs"].items()}
+    schemas = {names[name]: schema for name, schema in whole["$defs"].items()}
     for name, kind, is_localized in (("Localized", "then", True), ("NotLocalized", "else", False)):
         own = {key: value for key, value in whole[kind]["properties"].items() if value}
         flag = {"localized": {"type": "boolean", "const": is_localized}}
@@ -202,4 +176,18 @@ def _result_schemas() -> dict[str, Any]:
     schemas["NotLocalized"]["examples"] = [_REFUSED_EXAMPLE]
     kinds = [{"$ref": _REFERENCE.format(model=name)} for name in ("Localized", "NotLocalized")]
     schemas["Result"] = {"description": whole["description"], "oneOf": kinds}
-    return schemas | _RESULT_OF_MAPS
+    return schemas | _result_of_maps()
+
+
+def _result_of_maps() -> dict[str, Any]:
+    """Return the schemas of the results of all maps."""
+
+    def strict(**properties: Any) -> dict[str, Any]:
+        return {"type": "object", "required": list(properties), "properties": properties}
+
+    text, rows = {"type": "string"}, {"$ref": _REFERENCE.format(model="MapResult")}
+    only = {"type": ["string", "null"], "description": "the only map with a pose"}
+    answers = {"type": "array", "items": rows}
+    whole = strict(query=text, localized={"type": "boolean"}, map=only, answers=answers)
+    row = strict(map=text, result={"$ref": _REFERENCE.format(model="Result")})
+    return {"ResultOfMaps": whole, "MapResult": row}
