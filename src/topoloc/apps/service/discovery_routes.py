@@ -25,6 +25,7 @@ from topoloc.apps.service.discovery_messages import (
     enclose,
     parse_resource,
 )
+from topoloc.apps.service.geopose_messages import ROUTE
 from topoloc.apps.service.logs import log
 from topoloc.apps.service.openapi_schemas import OBJECT_RESPONSE, error_responses, request_body
 from topoloc.apps.service.query_request import read_body
@@ -44,8 +45,9 @@ async def get_bootstrap() -> Response:
 @router.get("/spatialdds-resolver", responses=OBJECT_RESPONSE | error_responses(401, 403))
 async def get_resolver(request: Request) -> JSONResponse:
     """Return where URIs of this service are resolved."""
-    base = f"{_base(request)}/.well-known/spatialdds/resolve"
-    facts = {"authority": _authority(request), "https_base": base, "cache_ttl_sec": Announced.ttl_s}
+    authority, base = _address(request)
+    facts = {"authority": authority, "cache_ttl_sec": Announced.ttl_s}
+    facts |= {"https_base": f"{base}/.well-known/spatialdds/resolve"}
     return JSONResponse(facts, headers=_HEADERS)
 
 
@@ -60,10 +62,10 @@ async def resolve_uri(
     parts = parse_resource(uri)
     if parts is None:
         raise RequestError(400, "uri: spatialdds://AUTHORITY/maps/service/NAME is expected")
-    authority, resource = parts
+    authority, base = _address(request)
     for one in await _announced(request):
-        if (authority, resource) == (_authority(request), one.resource):
-            manifest = one.manifest(authority, _base(request))
+        if parts == (authority, one.resource):
+            manifest = one.manifest(authority, base)
             digest = sha256(repr(manifest).encode()).hexdigest()[:32]
             return JSONResponse(manifest, headers=_HEADERS | {"etag": f'"{digest}"'})
     raise RequestError(404, f"there is no service {uri[:200]} here")
@@ -103,11 +105,9 @@ async def _search(request: Request, parse: Callable[[], SearchRequest]) -> JSONR
         raise invalid_request("search", error) from None
     found = [one for one in await _announced(request) if query.matches(one.box)]
     start, number = int(query.page_token or 0), min(query.max_results, 100)
-    page = found[start : start + number]
-    manifests = [one.manifest(_authority(request), _base(request)) for one in page]
+    manifests = [one.manifest(*_address(request)) for one in found[start : start + number]]
     token = str(start + number) if start + number < len(found) else ""
-    reply = SearchResponse(results=manifests, next_page_token=token)
-    return JSONResponse(reply.model_dump(), headers=_HEADERS)
+    return JSONResponse({"results": manifests, "next_page_token": token}, headers=_HEADERS)
 
 
 async def _announced(request: Request) -> list[Announced]:
@@ -124,17 +124,14 @@ def _look(service: Service, now_s: int) -> Iterator[Announced]:
     for atlas, localizer in service.query_handler.atlases.opened():
         tiles |= set(localizer.tile_ids)
         boxes = [one.geo_box for one in atlas.manifest.tiles if one.geo_box is not None]
-        if boxes:
-            corners = [corner for box in boxes for corner in (box[:2], box[2:])]
+        if corners := [corner for box in boxes for corner in (box[:2], box[2:])]:
             name, serial = PurePath(atlas.store.where).name, atlas.manifest.serial
-            yield Announced(name, serial, enclose(corners), "/localize/geopose", now_s)
-    for name in service.maps.names():
-        if name in tiles:
-            continue
+            yield Announced(name, serial, enclose(corners), ROUTE, now_s)
+    for name in (one for one in service.maps.names() if one not in tiles):
         try:
             with service.maps.use_map(name) as opened:
                 topomap = opened.content.topomap
-                path = f"/localize/geopose?map={quote(name, safe='')}"
+                path = f"{ROUTE}?map={quote(name, safe='')}"
                 if corners := _corners(topomap):
                     yield Announced(name, topomap.version, enclose(corners), path, now_s)
         except MapError as error:  # the others are announced all the same
@@ -151,9 +148,6 @@ def _corners(topomap: TopoMetricMap) -> list[tuple[float, float]]:
     return [(point.lat, point.lon) for point in map(place.geopoint, corners)]
 
 
-def _authority(request: Request) -> str:
-    return (request.url.hostname or "localhost").lower()
-
-
-def _base(request: Request) -> str:
-    return str(request.base_url).rstrip("/")
+def _address(request: Request) -> tuple[str, str]:
+    """Return the authority and the address of the service, as the client knows them."""
+    return (request.url.hostname or "localhost").lower(), str(request.base_url).rstrip("/")

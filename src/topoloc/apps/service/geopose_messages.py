@@ -23,6 +23,7 @@ from topoloc.apps.service.request_errors import RequestError, invalid_request
 from topoloc.plugin import EncodedImage
 
 R = TypeVar("R", bound=BaseModel)
+ROUTE = "/localize/geopose"
 MEDIA_TYPE = "application/vnd.oscp+json"
 _RAW_CHANNELS = {"RGBA32": 4, "GRAY8": 1}
 _VERSION = re.compile(r"version=\"?([0-9]+(?:\.[0-9]+)?)")

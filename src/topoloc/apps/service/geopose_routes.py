@@ -24,6 +24,7 @@ from topoloc import (
 from topoloc.apps.service.geopose_messages import (
     EXAMPLE,
     MEDIA_TYPE,
+    ROUTE,
     CameraReading,
     GeoPoseError,
     GeoPoseReply,
@@ -57,14 +58,14 @@ _ERRORS = {
 MapOnly = Annotated[str | None, Query(alias="map", description="use this map only", max_length=200)]
 
 
-@router.get("/localize/geopose", responses=error_responses(401, 403))
+@router.get(ROUTE, responses=error_responses(401, 403))
 async def get_geopose_state() -> dict[str, str]:
     """Return the state, as the protocol's reference server does."""
     return {"status": "running"}
 
 
 @router.post(
-    "/localize/geopose",
+    ROUTE,
     response_model=GeoPoseReply,
     responses={
         status: {"model": GeoPoseError, "description": text} for status, text in _ERRORS.items()
