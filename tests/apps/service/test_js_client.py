@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import re
@@ -10,8 +11,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from running_service import ROOT, SIGNED_TOKEN, Running
+from running_service import ROOT, SIGNED_TOKEN, Running, running
 
+from in_browser import chromium
 from schemas import SCHEMA
 
 CLIENT = ROOT / "clients" / "js"
@@ -47,6 +49,31 @@ def test_it_asks_a_service(open_service: Running, view: Path, camera: str):
         TOPOLOC_CAMERA=camera,
     )
     assert "# pass 9\n" in printed
+
+
+_IN_A_PAGE = """async ([url, token, base64]) => {
+  const { TopolocClient } = await import("/clients/js/index.js");
+  const client = new TopolocClient(url, { token });
+  const image = await (await fetch(`data:image/png;base64,${base64}`)).blob();
+  const stream = await client.stream("earth", { camera: "map" });
+  const states = [(await stream.next(image)).state, (await stream.next(image)).state];
+  await stream.close();
+  const refused = await client.map("nowhere").catch((one) => [one.status, one.requestId.length]);
+  return [await client.maps(), states[0], states.length, refused];
+}"""
+
+
+def test_a_page_of_another_origin_asks_with_a_token(
+    maps: Path, site: str, view: Path, tmp_path: Path
+):
+    (tmp_path / "token").write_text(SIGNED_TOKEN)
+    options = ("--token-file", tmp_path / "token", "--allow-origin", site)
+    image = base64.b64encode(view.read_bytes()).decode()
+    with chromium() as browser, running(maps / "earth.topo", *options) as service:
+        page = browser.new_page()
+        page.goto(f"{site}/examples/webxr/")
+        answers = page.evaluate(_IN_A_PAGE, [service.url, SIGNED_TOKEN, image])
+    assert answers == [["earth"], "localized", 2, [404, 32]]
 
 
 def _keys(interface: str) -> set[str]:

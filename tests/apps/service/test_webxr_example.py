@@ -5,18 +5,15 @@ from __future__ import annotations
 
 import base64
 import json
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from running_service import ROOT, running
+from running_service import running
 
 from in_browser import chromium
 from topoloc.geometry.geodesy import CAM_FROM_BODY, GeoPoint, GeoPose
@@ -69,20 +66,6 @@ SESSION = """(([image, projection, pose, inverse]) => {
 def browser() -> Iterator[Any]:
     with chromium() as browser:
         yield browser
-
-
-class _Files(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
-
-
-@pytest.fixture(scope="module")
-def site() -> Iterator[str]:
-    """The repository as `python -m http.server` shows it."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Files, directory=ROOT)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
 
 
 @pytest.fixture(scope="module")
