@@ -120,6 +120,7 @@ def test_who_searches_elsewhere_or_another_service_does_not(
         ({"geohash": "u15", "max_results": 0}, "max_results"),
         ({"geohash": "u15", "page_token": "next"}, "page_token"),
         ({"coverage": [{}]}, "coverage.0: a region has"),
+        ({"coverage": [{"global": True}] * 65}, "at most 64"),
         ({"coverage": [{"bbox": [4, 50, 5]}]}, "coverage.0.bbox"),
         ({"coverage": [{"bbox": [4, 51, 5, 50]}]}, "west, south, east, north"),
         ({"coverage": [{"bbox": HERE, "crs": "EPSG:3857"}]}, "crs"),

@@ -78,9 +78,9 @@ class CoverageElement(BaseModel):
 class SearchRequest(BaseModel):
     """A search by regions, a geohash or both."""
 
-    coverage: list[CoverageElement] = []
+    coverage: list[CoverageElement] = Field([], max_length=64)
     geohash: str | None = Field(None, pattern=f"^[{_GEOHASH_DIGITS}]{{3,7}}$")
-    kind: list[Kind] = []
+    kind: list[Kind] = Field([], max_length=8)
     filter: dict[str, list[str]] = Field({}, description="topics of DDS that services must have")
     max_results: int = Field(100, ge=1)
     page_token: str = Field("", pattern="^[0-9]{0,9}$")
