@@ -32,7 +32,7 @@ OPERATIONS = {
     "get_scene": "maps",
     "list_maps": "maps",
     "get_resolver": "discovery",
-    "resolve_uri": "discovery",
+    "resolve": "discovery",
     "search": "discovery",
     "search_by_geohash": "discovery",
     "get_capabilities": "service",

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from hashlib import sha256
 from itertools import product
 from pathlib import PurePath
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import numpy as np
@@ -46,24 +46,21 @@ async def get_bootstrap() -> Response:
 async def get_resolver(request: Request) -> JSONResponse:
     """Return where URIs of this service are resolved."""
     authority, base = _address(request)
-    facts = {"authority": authority, "cache_ttl_sec": Announced.ttl_s}
-    facts |= {"https_base": f"{base}/.well-known/spatialdds/resolve"}
-    return JSONResponse(facts, headers=_HEADERS)
+    place = {"authority": authority, "https_base": f"{base}/.well-known/spatialdds/resolve"}
+    return JSONResponse(place | {"cache_ttl_sec": Announced.ttl_s}, headers=_HEADERS)
 
 
 @router.get(
     "/spatialdds/resolve",
     responses=OBJECT_RESPONSE | error_responses(400, 401, 403, 404, 422, 429, 503),
 )
-async def resolve_uri(
-    request: Request, uri: Annotated[str, Query(max_length=2000)]
-) -> JSONResponse:
+async def resolve(request: Request, uri: Annotated[str, Query(max_length=2000)]) -> JSONResponse:
     """Return the manifest of a spatialdds URI."""
     parts = parse_resource(uri)
     if parts is None:
         raise RequestError(400, "uri: spatialdds://AUTHORITY/maps/service/NAME is expected")
-    authority, base = _address(request)
-    for one in await _announced(request):
+    service, (authority, base) = get_service(request), _address(request)
+    for one in await service.run_job(request, lambda: _announced(service)):
         if parts == (authority, one.resource):
             manifest = one.manifest(authority, base)
             digest = sha256(repr(manifest).encode()).hexdigest()[:32]
@@ -99,23 +96,26 @@ async def search(request: Request) -> JSONResponse:
 
 
 async def _search(request: Request, parse: Callable[[], SearchRequest]) -> JSONResponse:
-    try:
-        query = parse()
-    except ValidationError as error:
-        raise invalid_request("search", error) from None
-    found = [one for one in await _announced(request) if query.matches(one.box)]
-    start, number = int(query.page_token or 0), min(query.max_results, 100)
-    manifests = [one.manifest(*_address(request)) for one in found[start : start + number]]
-    token = str(start + number) if start + number < len(found) else ""
-    return JSONResponse({"results": manifests, "next_page_token": token}, headers=_HEADERS)
+    service, address = get_service(request), _address(request)
+
+    def find() -> dict[str, Any]:
+        try:
+            query = parse()
+        except ValidationError as error:
+            raise invalid_request("search", error) from None
+        found = [one for one in _announced(service) if query.matches(one.box)]
+        start, end = (int(query.page_token or 0) + one for one in (0, min(query.max_results, 100)))
+        manifests = [one.manifest(*address) for one in found[start:end]]
+        return {"results": manifests, "next_page_token": str(end) if end < len(found) else ""}
+
+    return JSONResponse(await service.run_job(request, find), headers=_HEADERS)
 
 
-async def _announced(request: Request) -> list[Announced]:
+def _announced(service: Service) -> list[Announced]:
     """Return all maps and atlases with a place on earth. They are looked at once a minute."""
-    service, now = get_service(request), time.time()
+    now = time.time()
     if service.announced is None or now - service.announced[0] > Announced.ttl_s:
-        found = await service.run_job(request, lambda: list(_look(service, int(now))))
-        service.announced = now, found
+        service.announced = now, list(_look(service, int(now)))
     return service.announced[1]
 
 
