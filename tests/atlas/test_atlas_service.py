@@ -118,6 +118,10 @@ def test_geopose_asks_the_atlas_and_only_tiles_near_the_device(
         data={"near": "50.9,4.7,10"},
     )
     assert answer.json()["localized"] is False
+    found = client.get("/.well-known/spatialdds/search", params={"geohash": "u15"}).json()
+    (service,) = (one["service"] for one in found["results"])
+    assert service["service_id"] == own_atlas.name, "the atlas, and none of its tiles"
+    assert service["hints"][0]["value"] == "http://127.0.0.1/localize/geopose"
 
 
 @pytest.mark.parametrize("near", ["here", "50,4", "100,0,5", "50,4,0"])

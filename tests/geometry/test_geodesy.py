@@ -8,8 +8,10 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from jsonschema import Draft202012Validator, ValidationError
 from pyproj import Transformer
 
+from schemas import GEOPOSE, GEOPOSE_YPR, SCHEMA, check_geopose
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, GeoPose, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -102,6 +104,41 @@ def test_json_is_strict_and_comes_again():
         "quaternion": set("xyzw"),
     }
     assert GeoPose.from_json(geopose.to_json()).to_json() == geopose.to_json()
+
+
+@given(lat=LATITUDES, lon=LONGITUDES, h=HEIGHTS, seed=st.integers(0, 2**32 - 1))
+def test_every_geopose_keeps_the_rules_of_the_standard(lat: float, lon: float, h: float, seed: int):
+    numbers = np.random.default_rng(seed)
+    turned = Rigid3(exp_so3(numbers.uniform(-4, 4, 3)), numbers.uniform(-1e4, 1e4, 3))
+    place = Georeference(GeoPoint(lat, lon, h), turned, "origin")
+    check_geopose(json.loads(json.dumps(place.geopose(turned).to_json())))
+
+
+_POSITION = {"lat": 48.2, "lon": 16.37, "h": 170.0}
+_QUATERNION = {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+_ANGLES = {"yaw": 5.5, "pitch": -0.2, "roll": 0.1}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"position": _POSITION},
+        {"position": _POSITION, "quaternion": list(_QUATERNION.values())},
+        {"position": _POSITION, "angles": _ANGLES},
+        {"location": {"lat": 48.2, "lon": 16.37, "h": 170.0}, "quaternion": _QUATERNION},
+        {"position": {"lat": 48.2, "lon": 16.37}, "quaternion": _QUATERNION},
+        {"position": _POSITION | {"lat": 91.0}, "quaternion": _QUATERNION},
+        {"position": _POSITION, "quaternion": _QUATERNION, "timestamp": 5},
+    ],
+    ids=str,
+)
+def test_the_rules_refuse_drafts_and_other_forms(wrong: dict[str, object]):
+    check_geopose({"position": _POSITION, "quaternion": _QUATERNION})
+    Draft202012Validator(GEOPOSE_YPR).validate({"position": _POSITION, "angles": _ANGLES})
+    with pytest.raises(ValidationError):
+        check_geopose(wrong)
+    strict = {key: rule for key, rule in SCHEMA["$defs"]["geopose"].items() if key != "description"}
+    assert strict == GEOPOSE, "the published schema of results has the same rules"
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from running_service import LIMITS, Running, running
+from running_service import LIMITS, PAGE, ROOT, SIGNED_TOKEN, Running, running
 
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -53,6 +56,23 @@ def client(service: Running) -> Iterator[httpx.Client]:
 
 
 @pytest.fixture(scope="session")
+def open_service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A service of the map `earth` with a token, for pages of two other origins too."""
+    token = tmp_path_factory.mktemp("token") / "token"
+    token.write_text(SIGNED_TOKEN)
+    origins = ("--allow-origin", PAGE, "--allow-origin", "http://localhost:3000")
+    with running(maps / "earth.topo", "--token-file", token, *origins) as service:
+        yield service
+
+
+@pytest.fixture(scope="session")
+def asked(open_service: Running) -> Iterator[httpx.Client]:
+    """Asks it with the token."""
+    with open_service.client(headers={"authorization": f"Bearer {SIGNED_TOKEN}"}) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
 def view(queries: Path) -> Path:
     """A picture of the room."""
     return queries / "view02.png"
@@ -62,3 +82,17 @@ def view(queries: Path) -> Path:
 def camera(queries: Path) -> str:
     """Its calibration, as the form's field takes it."""
     return (queries / "camera.json").read_text()
+
+
+class _Files(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture(scope="session")
+def site() -> Iterator[str]:
+    """The repository as `python -m http.server` shows it."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Files, directory=ROOT)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()

@@ -15,30 +15,18 @@ import jsonschema
 import numpy as np
 import pytest
 
+from schemas import GEOPOSE, check_geopose, strict_object
+
 ROUTE = "/localize/geopose"
 ACCEPT = "application/vnd.oscp+json;version=2.0;"
 _NUMBER = {"type": "number"}
-
-
-def _object(**members: Any) -> dict[str, Any]:
-    return {
-        "type": "object",
-        "required": list(members),
-        "properties": members,
-        "additionalProperties": False,
-    }
-
-
-# OGC 21-056r11, Basic-Quaternion, strict, within geoPoseRespSchema of gpp-access (lib/index.ts)
-REPLY = _object(
+# geoPoseRespSchema of gpp-access (lib/index.ts)
+REPLY = strict_object(
     id={"type": "string"},
     timestamp=_NUMBER,
     type={"const": "geopose"},
-    accuracy=_object(position=_NUMBER, orientation=_NUMBER),
-    geopose=_object(
-        position=_object(lat=_NUMBER, lon=_NUMBER, h=_NUMBER),
-        quaternion=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER),
-    ),
+    accuracy=strict_object(position=_NUMBER, orientation=_NUMBER),
+    geopose=GEOPOSE,
 )
 PRIVACY = {
     "dataRetention": [],
@@ -138,6 +126,7 @@ def test_recorded_requests_get_the_pose_of_the_native_answer(
     assert answer.status_code == 200, answer.text
     reply = answer.json()
     jsonschema.validate(reply, REPLY)
+    check_geopose(reply["geopose"])
     assert (reply["id"], reply["timestamp"]) == (request["id"], request["timestamp"])
     native = client.post(
         "/v1/maps/earth/localize", files={"image": view.open("rb")}, data={"camera": camera}

@@ -13,8 +13,9 @@ from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import unquote
 
+from topoloc.apps.service.cross_origin import CrossOrigin
 from topoloc.apps.service.logs import Metrics, log
 from topoloc.apps.service.request_errors import RequestError
 
@@ -27,7 +28,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 BEARER_PROTOCOL = "bearer."
 """WebSockets of browsers cannot send headers. They name the subprotocols `topoloc` and this prefix
-with the token."""
+with the token, percent-encoded where it has signs that no subprotocol may have."""
 _PUBLIC_PATHS = ("/healthz", "/")
 _PUBLIC_FOLDERS = ("/static/",)
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -45,12 +46,14 @@ class RequestLimits:
             reach the service under their own name.
         max_bytes: size of a request.
         upload_s: seconds until a request must be complete.
+        cross_origin: the pages of other sites that may ask.
     """
 
     token: str | None
     loopback_only: bool
     max_bytes: int
     upload_s: float
+    cross_origin: CrossOrigin
 
 
 class AccessMiddleware:
@@ -65,7 +68,11 @@ class AccessMiddleware:
             return
         request = _Request(scope, receive, send, self._limits)
         try:
-            self._check(request)
+            self._check_sender(request)
+            if request.is_preflight:
+                await request.send_preflight()
+                return
+            self._check_request(request)
             await self._app(scope, request.receive, request.send)
         except RequestError as refusal:
             await request.reject(refusal)
@@ -80,15 +87,20 @@ class AccessMiddleware:
         finally:
             self._log_request(request)
 
-    def _check(self, request: _Request) -> None:
-        """Check host, origin, token and announced size. Raises RequestError."""
+    def _check_sender(self, request: _Request) -> None:
+        """Check host and origin. Raises RequestError."""
         host, origin = request.header("host"), request.header("origin")
         if self._limits.loopback_only and _host_name(host) not in LOOPBACK:
             raise RequestError(
                 421, "this service answers on this machine only, as 127.0.0.1 and localhost"
             )
-        if origin and urlsplit(origin).netloc.lower() != host.lower():
-            raise RequestError(403, "requests from pages of other sites are not answered")
+        if not self._limits.cross_origin.allows(origin, host):
+            raise RequestError(
+                403, f"pages of {origin[:80]} are not answered; allow them with --allow-origin"
+            )
+
+    def _check_request(self, request: _Request) -> None:
+        """Check token and announced size. Raises RequestError."""
         path, token = request.scope["path"], self._limits.token
         is_public = path in _PUBLIC_PATHS or path.startswith(_PUBLIC_FOLDERS)
         if token is not None and not is_public:
@@ -145,7 +157,21 @@ class _Request:
             return token.strip()
         offered = (one.strip() for one in self.header("sec-websocket-protocol").split(","))
         tokens = [one for one in offered if one.startswith(BEARER_PROTOCOL)]
-        return tokens[0].removeprefix(BEARER_PROTOCOL) if tokens else ""
+        return unquote(tokens[0].removeprefix(BEARER_PROTOCOL)) if tokens else ""
+
+    @property
+    def is_preflight(self) -> bool:
+        """Whether a browser asks for the headers of a later request. It sends no token."""
+        is_options = self.scope.get("method") == "OPTIONS" and bool(self.header("origin"))
+        return is_options and bool(self.header("access-control-request-method"))
+
+    async def send_preflight(self) -> None:
+        """Tell a browser which requests the pages of an allowed origin may send."""
+        is_private_network = bool(self.header("access-control-request-private-network"))
+        headers = self._limits.cross_origin.preflight_headers(is_private_network)
+        start = {"status": 204, "headers": _encode_headers(headers)}
+        await self.send({"type": "http.response.start"} | start)
+        await self.send({"type": "http.response.body"})
 
     def check_size(self, num_bytes: int) -> None:
         """Raise RequestError if a request of this size is too large."""
@@ -171,7 +197,9 @@ class _Request:
     async def send(self, message: Message) -> None:
         if message["type"] in ("http.response.start", "websocket.http.response.start"):
             self.status = message["status"]
-            message["headers"] = [*message.get("headers", ()), (b"x-request-id", self.id.encode())]
+            more = self._limits.cross_origin.response_headers(self.header("origin"))
+            added = _encode_headers({"x-request-id": self.id} | more)
+            message["headers"] = [*message.get("headers", ()), *added]
         elif message["type"] == "websocket.accept":
             self.status = 101
         await self._send(message)
@@ -188,8 +216,8 @@ class _Request:
         headers = {"content-type": "application/json", "content-length": str(len(body))}
         headers |= {"connection": "close"} | refusal.headers
         headers |= {"www-authenticate": "Bearer"} if refusal.status == 401 else {}
-        encoded = [(name.lower().encode(), value.encode()) for name, value in headers.items()]
-        await self.send({"type": f"{kind}.start", "status": refusal.status, "headers": encoded})
+        start = {"status": refusal.status, "headers": _encode_headers(headers)}
+        await self.send({"type": f"{kind}.start"} | start)
         await self.send({"type": f"{kind}.body", "body": body})
 
     async def _discard_rest(self) -> None:
@@ -207,6 +235,10 @@ class _Request:
                 return
             left -= len(message.get("body", b""))
             self._is_complete = not message.get("more_body", False)
+
+
+def _encode_headers(headers: dict[str, str]) -> list[tuple[bytes, bytes]]:
+    return [(name.lower().encode(), value.encode("latin-1")) for name, value in headers.items()]
 
 
 def _host_name(host: str) -> str:

@@ -7,10 +7,11 @@ import contextlib
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Collection, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request
@@ -19,11 +20,13 @@ from fastapi.responses import JSONResponse, Response
 
 import topoloc
 from topoloc import AtlasConfig, Localizer, MapCache, TopolocError, TrackerConfig
-from topoloc.apps.service import geopose_routes, map_routes, stream_routes
+from topoloc.apps.service import discovery_routes, geopose_routes, map_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
+from topoloc.apps.service.cross_origin import CrossOrigin
 from topoloc.apps.service.logs import Metrics, log, log_json
+from topoloc.apps.service.openapi_schemas import complete_document
 from topoloc.apps.service.query_handler import ImageDecoder, QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, Streams, Workers
@@ -41,9 +44,10 @@ def create_application(
     loopback_only: bool = True,
     tracking: TrackerConfig | None = None,
     atlas_config: AtlasConfig | None = None,
+    origins: Collection[str] = (),
 ) -> App:
     """Create the application. It closes the maps when it ends. See `RequestLimits` for `token` and
-    `loopback_only`."""
+    `loopback_only`; pages of `origins` may ask."""
     metrics = Metrics()
     atlases = ServedAtlases(maps, atlas_config or AtlasConfig())
     query_handler = QueryHandler(
@@ -67,22 +71,33 @@ def create_application(
         await service.close()
         log("ended")
 
-    app = FastAPI(
+    app = _Application(
         title="topoloc",
         version=topoloc.__version__,
         description=_DESCRIPTION,
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        generate_unique_id_function=lambda route: route.name,
     )
     app.state.service = service
-    for routes in (map_routes, geopose_routes, stream_routes):
+    for routes in (map_routes, geopose_routes, stream_routes, discovery_routes):
         app.include_router(routes.router)
     for kind in (RequestError, HTTPException, RequestValidationError, 404, 405):
         app.add_exception_handler(kind, _error_response)
     bounds = config.max_upload_bytes, config.upload_s
-    limits = RequestLimits(token, loopback_only, *bounds)
+    limits = RequestLimits(token, loopback_only, *bounds, CrossOrigin(origins))
     return AccessMiddleware(app, limits, metrics)
+
+
+class _Application(FastAPI):
+    """The routes, and their document for generators of clients."""
+
+    def openapi(self) -> dict[str, Any]:
+        if self.openapi_schema is None:
+            self.openapi_schema = complete_document(super().openapi())
+        return self.openapi_schema
 
 
 async def _error_response(request: Request, error: Exception) -> Response:

@@ -19,10 +19,11 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from topoloc import AtlasError, GeoPose, GeoPositionPrior, Georeference, Image, Localization
-from topoloc.apps.service.request_errors import RequestError
+from topoloc.apps.service.request_errors import RequestError, invalid_request
 from topoloc.plugin import EncodedImage
 
 R = TypeVar("R", bound=BaseModel)
+ROUTE = "/localize/geopose"
 MEDIA_TYPE = "application/vnd.oscp+json"
 _RAW_CHANNELS = {"RGBA32": 4, "GRAY8": 1}
 _VERSION = re.compile(r"version=\"?([0-9]+(?:\.[0-9]+)?)")
@@ -145,7 +146,7 @@ class GeoPoseRequest(BaseModel):
         try:
             return [kind.model_validate(one) for one in data]
         except ValidationError as error:
-            raise _to_request_error("invalid reading", error) from None
+            raise invalid_request("invalid reading", error) from None
 
 
 class Accuracy(BaseModel):
@@ -210,7 +211,7 @@ def read_request(body: bytes) -> GeoPoseRequest:
     try:
         return GeoPoseRequest.model_validate_json(body)
     except ValidationError as error:
-        raise _to_request_error("no GeoPose request", error) from None
+        raise invalid_request("no GeoPose request", error) from None
 
 
 def read_image_bytes(reading: CameraReading) -> EncodedImage | Image:
@@ -271,8 +272,3 @@ def create_reply(
         accuracy=Accuracy(position=metres, orientation=mean * result.rotation_sigma_deg),
         geopose=GeoPoseOgc.model_validate(geopose.to_json()),
     )
-
-
-def _to_request_error(problem: str, error: ValidationError) -> RequestError:
-    first = error.errors(include_input=False, include_url=False)[0]
-    return RequestError(400, f"{problem}: {'.'.join(map(str, first['loc']))}: {first['msg']}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
@@ -24,6 +24,7 @@ from topoloc import (
 from topoloc.apps.service.geopose_messages import (
     EXAMPLE,
     MEDIA_TYPE,
+    ROUTE,
     CameraReading,
     GeoPoseError,
     GeoPoseReply,
@@ -35,19 +36,18 @@ from topoloc.apps.service.geopose_messages import (
     read_image_size,
     read_request,
 )
-from topoloc.apps.service.openapi_schemas import resolve_references
+from topoloc.apps.service.openapi_schemas import error_responses, request_body
 from topoloc.apps.service.query_handler import fit_camera
 from topoloc.apps.service.query_request import camera_from_json, parse_camera_field, read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 from topoloc.plugin import EncodedImage
 
-router = APIRouter()
+router = APIRouter(tags=["geopose"])
 Results = dict[str, Localization | NotLocalized]
 _MAX_DISAGREEMENT_M = 10.0
 _ERRORS = {
     400: "invalid request, or an unknown version",
-    401: "the token is missing or wrong",
     404: "not localized: reason",
     408: "the request came too slowly",
     409: "no map is georeferenced",
@@ -55,29 +55,23 @@ _ERRORS = {
     429: "too many requests wait",
     503: "the service failed",
 }
-_SCHEMA = resolve_references(GeoPoseRequest.model_json_schema())
-_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {"application/json": {"schema": _SCHEMA, "example": EXAMPLE}},
-    }
-}
 MapOnly = Annotated[str | None, Query(alias="map", description="use this map only", max_length=200)]
 
 
-@router.get("/localize/geopose")
-async def geopose_lives() -> dict[str, str]:
+@router.get(ROUTE, responses=error_responses(401, 403))
+async def get_geopose_state() -> dict[str, str]:
     """Return the state, as the protocol's reference server does."""
     return {"status": "running"}
 
 
 @router.post(
-    "/localize/geopose",
+    ROUTE,
     response_model=GeoPoseReply,
     responses={
         status: {"model": GeoPoseError, "description": text} for status, text in _ERRORS.items()
-    },
-    openapi_extra=_BODY,
+    }
+    | error_responses(401, 403, 422),
+    openapi_extra=request_body(GeoPoseRequest, EXAMPLE),
 )
 async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
     """Localize an image on earth. The body frame of the camera is x forward, y left, z up; the pose

@@ -12,14 +12,19 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
+from pydantic import BaseModel
 
 import topoloc
 from topoloc import Camera
+from topoloc.apps.service.discovery_messages import SPATIALDDS
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
+    OBJECT_RESPONSE,
+    PUBLIC,
     QUERY_ERRORS,
     QueryParameters,
     error_responses,
+    named_response,
     result_response,
 )
 from topoloc.apps.service.query_handler import combine_results, result_to_line
@@ -48,8 +53,8 @@ _TYPES = {
 _NUM_CACHED_SCENES = 4
 
 
-@router.get("/healthz", responses=error_responses(503))
-async def health(request: Request) -> dict[str, Any]:
+@router.get("/healthz", responses=error_responses(503), tags=["service"], openapi_extra=PUBLIC)
+async def get_health(request: Request) -> dict[str, Any]:
     """Return the state of the service."""
     service = get_service(request)
     return {"status": "ok", "jobs": service.workers.num_jobs, "open_maps": service.maps.num_open}
@@ -59,15 +64,16 @@ async def health(request: Request) -> dict[str, Any]:
     "/metrics",
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}}
-    | error_responses(401),
+    | error_responses(401, 403),
+    tags=["service"],
 )
-async def metrics(request: Request) -> Response:
+async def get_metrics(request: Request) -> Response:
     """Return counters and times for Prometheus."""
     return Response(get_service(request).metrics.text(), media_type="text/plain; version=0.0.4")
 
 
-@router.get("/capabilities", responses=error_responses(401, 503))
-async def capabilities(request: Request) -> dict[str, Any]:
+@router.get("/capabilities", responses=error_responses(401, 403, 503), tags=["service"])
+async def get_capabilities(request: Request) -> dict[str, Any]:
     """Return the services, maps, camera models and limits."""
     service = get_service(request)
     config = service.config
@@ -78,6 +84,7 @@ async def capabilities(request: Request) -> dict[str, Any]:
         "maps": service.maps.names(),
         "camera_models": Camera.model_names(),
         "geopose_protocol": ["1.0", "2.0"],
+        "spatialdds": [SPATIALDDS],
         "limits": {
             "megabytes": config.max_upload_mb,
             "megapixels": config.max_megapixels,
@@ -86,14 +93,24 @@ async def capabilities(request: Request) -> dict[str, Any]:
     }
 
 
-@router.get("/v1/maps", responses=error_responses(401, 503))
-async def maps(request: Request) -> dict[str, list[str]]:
+class MapNames(BaseModel):
+    """The names of all maps of a service."""
+
+    maps: list[str]
+
+
+@router.get("/v1/maps", responses=error_responses(401, 403, 503), tags=["maps"])
+async def list_maps(request: Request) -> MapNames:
     """Return the names of all maps."""
-    return {"maps": get_service(request).maps.names()}
+    return MapNames(maps=get_service(request).maps.names())
 
 
-@router.get("/v1/maps/{map}", responses=error_responses(401, 404, 422, 429, 503))
-async def one_map(request: Request, map: MapName) -> JSONResponse:
+@router.get(
+    "/v1/maps/{map}",
+    responses=OBJECT_RESPONSE | error_responses(401, 403, 404, 422, 429, 503),
+    tags=["maps"],
+)
+async def get_map(request: Request, map: MapName) -> JSONResponse:
     """Return the facts of a map, as `topoloc info --json`, and its nodes with their poses."""
     service = get_service(request)
 
@@ -120,6 +137,7 @@ async def one_map(request: Request, map: MapName) -> JSONResponse:
     responses=result_response("pose or refusal, as a line of `topoloc localize --json`")
     | QUERY_ERRORS,
     openapi_extra=IMAGE_BODY,
+    tags=["localization"],
 )
 async def localize(request: Request, map: MapName, parameters: UrlParameters) -> Response:
     """Localize an image in one map."""
@@ -131,7 +149,12 @@ async def localize(request: Request, map: MapName, parameters: UrlParameters) ->
     return Response(result_to_line(result, query.picture.name), media_type="application/json")
 
 
-@router.post("/v1/localize", responses=QUERY_ERRORS, openapi_extra=IMAGE_BODY)
+@router.post(
+    "/v1/localize",
+    responses=named_response("ResultOfMaps", "results of all maps") | QUERY_ERRORS,
+    openapi_extra=IMAGE_BODY,
+    tags=["localization"],
+)
 async def localize_everywhere(request: Request, parameters: UrlParameters) -> JSONResponse:
     """Localize an image in all maps. `map` names the map of the only pose; it is null if there are
     no poses or several."""
@@ -157,6 +180,7 @@ async def localize_everywhere(request: Request, parameters: UrlParameters) -> JS
     }
     | QUERY_ERRORS,
     openapi_extra=IMAGE_BODY,
+    tags=["localization"],
 )
 async def explain(request: Request, map: MapName, parameters: UrlParameters) -> Response:
     """Localize an image and return all tried poses: JSON, or a page if text/html is accepted."""
@@ -168,8 +192,12 @@ async def explain(request: Request, map: MapName, parameters: UrlParameters) -> 
     return HTMLResponse(text) if as_page else Response(text, media_type="application/json")
 
 
-@router.get("/v1/maps/{map}/scene", responses=error_responses(401, 404, 422, 429, 503))
-async def scene(request: Request, map: MapName) -> Response:
+@router.get(
+    "/v1/maps/{map}/scene",
+    responses=OBJECT_RESPONSE | error_responses(401, 403, 404, 422, 429, 503),
+    tags=["maps"],
+)
+async def get_scene(request: Request, map: MapName) -> Response:
     """Return a map for display: points, nodes with their images, and paths. See docs/viewer.md."""
     service, stop = get_service(request), threading.Event()
     body = await service.run_job(request, lambda: build_scene(service, map, stop), stop)

@@ -82,8 +82,22 @@ IMAGE_BODY: dict[str, Any] = {
         | {kind: {"schema": _FILE} for kind in ("image/jpeg", "image/png")},
     }
 }
+_REFERENCE = "#/components/schemas/{model}"
+_TAGS = [
+    {"name": "localization", "description": "Poses of single images."},
+    {"name": "streams", "description": "Poses of successive images."},
+    {"name": "geopose", "description": "The OSCP GeoPose Protocol."},
+    {"name": "discovery", "description": "Maps of a region, by SpatialDDS 1.6."},
+    {"name": "maps", "description": "What maps hold."},
+    {"name": "service", "description": "Health, features and counters."},
+]
+OBJECT_RESPONSE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/json": {"schema": {"type": "object"}}}}
+}
+PUBLIC: dict[str, Any] = {"security": []}
+"""Of a route that takes no token."""
 _ERROR_DESCRIPTIONS = {
-    400: "no image, a damaged image, or an unreadable form",
+    400: "an invalid request, no image or a damaged one, or an unreadable form",
     401: "the token is missing or wrong",
     403: "the request comes from a page of another site",
     404: "no such map or session",
@@ -109,25 +123,71 @@ QUERY_ERRORS = error_responses(400, 401, 403, 404, 408, 413, 415, 422, 429, 503)
 
 
 def result_response(description: str) -> dict[int | str, dict[str, Any]]:
-    """Return the OpenAPI response 200 with the schema of one localization result."""
+    """Return the OpenAPI response 200 with one localization result."""
+    return named_response("Result", description)
+
+
+def named_response(name: str, description: str) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI response 200 with a schema of `complete_document`."""
+    schema = {"$ref": _REFERENCE.format(model=name)}
+    return {200: {"description": description, "content": {"application/json": {"schema": schema}}}}
+
+
+def request_body(kind: type[BaseModel], example: Any) -> dict[str, Any]:
+    """Return the OpenAPI request body of JSON of this kind. `complete_document` adds its parts."""
+    schema = kind.model_json_schema(ref_template=_REFERENCE)
+    parts = schema.pop("$defs", {})
+    content = {"application/json": {"schema": schema, "example": example}}
+    return {"requestBody": {"required": True, "content": content}, "x-parts": parts}
+
+
+def complete_document(document: dict[str, Any]) -> dict[str, Any]:
+    """Add the schemas of results and requests and the bearer token to an OpenAPI document."""
+    parts = document["components"]
+    for methods in document["paths"].values():
+        for operation in methods.values():
+            parts["schemas"] |= operation.pop("x-parts", {})
+    parts["schemas"] |= _result_schemas()
+    about = "content of the service's `--token-file`; a service without one takes any request"
+    parts["securitySchemes"] = {
+        "bearer": {"type": "http", "scheme": "bearer", "description": about}
+    }
+    return document | {"security": [{"bearer": []}, {}], "tags": _TAGS}
+
+
+def _result_schemas() -> dict[str, Any]:
+    """Return result.schema.json as named schemas. Two objects stand for its conditions, and a
+    boolean for its constant: generators of clients fail at these."""
     file = resources.files("topoloc.localization").joinpath("result.schema.json")
-    schema = resolve_references(json.loads(file.read_text(encoding="utf-8")))
-    shown = {name: value for name, value in schema.items() if not name.startswith("$")}
-    shown["examples"] = [_REFUSED_EXAMPLE]
-    return {200: {"description": description, "content": {"application/json": {"schema": shown}}}}
+    text = file.read_text(encoding="utf-8").replace('"const": false', '"type": "boolean"')
+    names = {name: name.title().replace("pose", "Pose") for name in json.loads(text)["$defs"]}
+    for name, shown in names.items():
+        text = text.replace(f"#/$defs/{name}", _REFERENCE.format(model=shown))
+    whole = json.loads(text)
+    schemas = {names[name]: schema for name, schema in whole["$defs"].items()}
+    for name, kind, is_localized in (("Localized", "then", True), ("NotLocalized", "else", False)):
+        own = {key: value for key, value in whole[kind]["properties"].items() if value}
+        flag = {"localized": {"type": "boolean", "const": is_localized}}
+        schemas[name] = {
+            "type": "object",
+            "required": whole["required"] + whole[kind]["required"],
+            "properties": whole["properties"] | flag | own,
+        }
+    schemas["NotLocalized"]["examples"] = [_REFUSED_EXAMPLE]
+    kinds = [{"$ref": _REFERENCE.format(model=name)} for name in ("Localized", "NotLocalized")]
+    schemas["Result"] = {"description": whole["description"], "oneOf": kinds}
+    return schemas | _result_of_maps()
 
 
-def resolve_references(schema: dict[str, Any]) -> dict[str, Any]:
-    """Return a schema with the references to its own `$defs` replaced by their content."""
-    named = schema.get("$defs", {})
+def _result_of_maps() -> dict[str, Any]:
+    """Return the schemas of the results of all maps."""
 
-    def resolve_value(value: Any) -> Any:
-        if isinstance(value, list):
-            return [resolve_value(one) for one in value]
-        if not isinstance(value, dict):
-            return value
-        if "$ref" in value:
-            return resolve_value(named[value["$ref"].rpartition("/")[2]])
-        return {name: resolve_value(one) for name, one in value.items() if name != "$defs"}
+    def strict(**properties: Any) -> dict[str, Any]:
+        return {"type": "object", "required": list(properties), "properties": properties}
 
-    return resolve_value(schema)
+    text, rows = {"type": "string"}, {"$ref": _REFERENCE.format(model="MapResult")}
+    only = {"type": ["string", "null"], "description": "the only map with a pose"}
+    answers = {"type": "array", "items": rows}
+    whole = strict(query=text, localized={"type": "boolean"}, map=only, answers=answers)
+    row = strict(map=text, result={"$ref": _REFERENCE.format(model="Result")})
+    return {"ResultOfMaps": whole, "MapResult": row}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pydantic import ValidationError
+
 from topoloc import (
     MapError,
     MapNotFoundError,
@@ -28,6 +30,15 @@ class RequestError(Exception):
     def to_json(self, request_id: str) -> dict[str, str]:
         """Return the body of the response."""
         return {"error": " ".join(self.text.split()), "request_id": request_id}
+
+
+def invalid_request(problem: str, error: ValidationError) -> RequestError:
+    """Return the first fault of JSON, with its place."""
+    first = error.errors(include_input=False, include_url=False)[0]
+    fault = first["msg"].removeprefix("Value error, ")
+    return RequestError(
+        400, ": ".join(filter(None, (problem, ".".join(map(str, first["loc"])), fault)))
+    )
 
 
 def to_request_error(error: Exception) -> RequestError:

@@ -29,6 +29,7 @@ from topoloc import (
 )
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import while_connected
+from topoloc.apps.service.discovery_messages import Announced
 from topoloc.apps.service.logs import Metrics, log
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
@@ -209,7 +210,8 @@ class Workers:
 
 @dataclass(eq=False)
 class Service:
-    """Maps, workers and counters. `scenes` caches documents with the stamps of their files."""
+    """Maps, workers and counters. `scenes` caches documents with the stamps of their files,
+    `announced` places with the time when they were looked at."""
 
     maps: MapCache[Localizer]
     query_handler: QueryHandler
@@ -218,6 +220,7 @@ class Service:
     metrics: Metrics
     streams: Streams
     scenes: dict[str, tuple[tuple[int, ...], bytes]] = field(default_factory=dict)
+    announced: tuple[float, list[Announced]] | None = None
     num_awaiting: int = 0
 
     async def run_job(

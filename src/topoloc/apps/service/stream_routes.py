@@ -28,7 +28,7 @@ from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, Stream, get_service
 from topoloc.plugin import EncodedImage, decode_json
 
-router = APIRouter()
+router = APIRouter(tags=["streams"])
 PROTOCOL = "topoloc"
 """The subprotocol that a browser names beside the one with its token."""
 TimeNs = Annotated[
@@ -53,7 +53,7 @@ class StreamFacts(BaseModel):
     status_code=201,
     responses=error_responses(401, 403, 404, 422, 429, 503),
 )
-async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> StreamFacts:
+async def begin_stream(request: Request, map: MapName, camera: StreamCamera = None) -> StreamFacts:
     """Begin a stream of successive images. Each result supports the next one."""
     service, address = get_service(request), client_address(request.client)
     stream = await service.run_job(request, lambda: service.streams.begin(map, camera, address))
@@ -67,7 +67,7 @@ async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> 
     | error_responses(409),
     openapi_extra=IMAGE_BODY,
 )
-async def next_picture(
+async def localize_next(
     request: Request, map: MapName, session: str, parameters: UrlParameters, t_ns: TimeNs = None
 ) -> Response:
     """Localize the next image of a stream."""
@@ -87,7 +87,7 @@ async def next_picture(
     status_code=204,
     responses=error_responses(401, 403, 404, 422, 503),
 )
-async def end(request: Request, map: MapName, session: str) -> Response:
+async def end_stream(request: Request, map: MapName, session: str) -> Response:
     """End a stream."""
     service = get_service(request)
     stream = service.streams.find(map, session)

@@ -24,6 +24,7 @@ from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, catch_sto
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ReplicasConfig
 from topoloc.apps.service.config import ServiceConfig
+from topoloc.apps.service.cross_origin import ANY_ORIGIN, parse_origin
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MIN_TOKEN_LENGTH = 16
@@ -42,13 +43,14 @@ class ServedMaps:
     localizer: LocalizerConfig
     tracker: TrackerConfig
     atlas: AtlasConfig
+    origins: tuple[str, ...]
 
     def application(self):  # no return type: the service is an extra, and loaded here alone
         """Return the application. It opens maps at their first request. Raises TopolocError."""
         from topoloc.apps.service.application import create_application
 
         access = read_token(self.token_file), self.loopback_only
-        configs = self.tracker, self.atlas
+        configs = self.tracker, self.atlas, self.origins
         return create_application(self._open_maps(), self.service, *access, *configs)
 
     def _open_maps(self) -> MapCache[Localizer]:
@@ -107,6 +109,11 @@ class Command:
     """Its private key (PEM)."""
     behind_proxy: Flag = False
     """A proxy in front of the service speaks TLS with the clients."""
+    allow_origin: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], option("URL", "pages of the service only")
+    ] = ()
+    """Origin whose pages may ask, as https://app.example; repeat it for more. `*`, any page, needs
+    --token-file."""
     features: QUERY_FEATURES = None
     memory_mb: Annotated[int | None, option("N", "512")] = None
     """Megabytes of maps in memory. The least recently used map is closed first."""
@@ -160,7 +167,14 @@ class Command:
         is_private = self.host in _LOOPBACK and not self.behind_proxy
         access = (_absolute_path(self.token_file), is_private)
         configs = settings.of(LocalizerConfig), settings.of(TrackerConfig), settings.of(AtlasConfig)
-        return ServedMaps(paths, self.features, *access, config, *configs)
+        return ServedMaps(paths, self.features, *access, config, *configs, self._origins())
+
+    def _origins(self) -> tuple[str, ...]:
+        """Return the allowed origins, checked."""
+        try:
+            return tuple(parse_origin(one) for one in self.allow_origin)
+        except ValueError as error:
+            raise UsageError(f"--allow-origin {error}") from None
 
     def _parse_replicas(self, config: ReplicasConfig) -> ReplicasConfig:
         if self.replicas is None:
@@ -178,6 +192,8 @@ class Command:
         """Refuse other machines without a token, or without TLS."""
         if (self.tls_cert is None) != (self.tls_key is None):
             raise UsageError("--tls-cert and --tls-key go together")
+        if ANY_ORIGIN in self._origins() and self.token_file is None:
+            raise UsageError("--allow-origin *: any page could ask: --token-file FILE is needed")
         is_private = self.host in _LOOPBACK and not self.behind_proxy
         if not is_private and self.token_file is None:
             raise UsageError(
