@@ -6,10 +6,16 @@ Its odometry drifts: it takes each way for 2 % longer, and turns half a degree a
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,6 +56,7 @@ class Heard:
     (arrival, stamp, pose), statuses as (arrival, level, text, values). Arrivals are nanoseconds."""
 
     transforms: list[tuple[int, int, Rigid3]] = field(default_factory=list)
+    others: list[tuple[str, int, Rigid3]] = field(default_factory=list)
     poses: list[tuple[int, int, Rigid3]] = field(default_factory=list)
     statuses: list[tuple[int, int, str, dict[str, str]]] = field(default_factory=list)
 
@@ -68,6 +75,7 @@ class PlayedRobot:
 
     def __init__(self, camera: Camera, domain: int, hz: float = 10.0) -> None:
         self.camera, self.hz, self.heard = camera, hz, Heard()
+        self.is_calibrated = True  # otherwise K is zero
         self._node = RosNode(RobotConfig(domain=domain))
         self.ros = ros = self._node.messages
         create = self._node.create_writer
@@ -95,7 +103,8 @@ class PlayedRobot:
         """Wait until somebody reads the images."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            if self._image.__self__.get_matched_subscriptions():
+            writer: Any = self._image
+            if writer.__self__.get_matched_subscriptions():
                 return True
             time.sleep(0.05)
         return False
@@ -109,9 +118,9 @@ class PlayedRobot:
 
     def play(self, steps: Sequence[Step]) -> None:
         """Drive. Truth and odometry of this drive can be asked for afterwards."""
-        odom = self.odometry[-1] if self.odometry else BASE_FROM_CAM.inverse().inverse()
+        odom = self.odometry[-1] if self.odometry else BASE_FROM_CAM
         self.odometry, self.steps = [odom], list(steps)
-        for before, after in zip(steps, steps[1:], strict=False):
+        for before, after in pairwise(steps):
             if not after.is_carried:
                 motion = before.world_from_cam.inverse() @ after.world_from_cam
                 odom = odom @ _drifted(motion)
@@ -187,6 +196,7 @@ class PlayedRobot:
         ros, camera, noise = self.ros, self.camera, np.random.default_rng(0)
         fx, fy, cx, cy = camera.params
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+        matrix = matrix if self.is_calibrated else [0.0] * 9
         projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
         roi = ros.RegionOfInterest(0, 0, 0, 0, False)
         for number, step in enumerate(self.steps):
@@ -232,7 +242,9 @@ class PlayedRobot:
 
     def _hear_tf(self, message: Any) -> None:
         for one in map(stamped_transform, message.transforms):
-            if (one.parent, one.child) == ("map", "odom"):
+            if one.parent == "map" and one.child != "odom":
+                self.heard.others.append((one.child, one.t_ns, pose_of_transform(one)))
+            elif one.parent == "map":
                 self.heard.transforms.append((time.time_ns(), one.t_ns, pose_of_transform(one)))
 
     def _hear_pose(self, message: Any) -> None:
@@ -243,6 +255,24 @@ class PlayedRobot:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             self.heard.statuses.append((time.time_ns(), status.level, status.message, values))
+
+
+@contextmanager
+def followed(topomap: Path, domain: int, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """`topoloc follow MAP ros:/camera/image_raw --ros`, as a user types it, in its own process."""
+    command = [sys.executable, "-m", "topoloc", "follow", str(topomap), f"ros:{IMAGE_TOPIC}"]
+    environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
+    with subprocess.Popen(
+        [*command, *options],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def _drifted(motion: Rigid3) -> Rigid3:

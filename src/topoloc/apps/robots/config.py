@@ -49,7 +49,7 @@ class RobotConfig:
     """Radians per second by which smooth corrections turn the robot."""
     odometry_error: Annotated[float, Between(0, 1)] = 0.05
     """Error of the odometry, as a share of the way and of the rotation (one sigma)."""
-    warn_after: Annotated[float, Above(0)] = 2.0
+    warn_after: Annotated[float, Above(0)] = 1.0
     """Seconds without evidence after which /diagnostics says WARN."""
     lost_after: Annotated[float, Above(0)] = 10.0
     """Seconds without evidence after which /diagnostics says ERROR."""

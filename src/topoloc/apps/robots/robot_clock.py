@@ -39,7 +39,7 @@ class RobotClock:
     @property
     def is_foreign(self) -> bool:
         """Return whether the stamps are of another clock."""
-        least = 10  # images; the first ones have waited
+        least = 3  # images; the first ones have waited
         return len(self._delays_ns) >= least and abs(self.offset) > self._max_offset
 
     def now_ns(self) -> int:

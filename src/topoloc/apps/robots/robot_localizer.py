@@ -63,7 +63,8 @@ class RobotLocalizer:
         self._map_to_odom, self._health = MapToOdom(config), Health()
         self._odometry: Odometry | None = None
         self._user_pose: Any = None
-        self._last_ns, self._last_stamp_ns, self._warned = 0, 0, set[str]()
+        self._last_ns = self._last_stamp_ns = self._num_answers = 0
+        self._warned = set[str]()
         self._lock, self._is_closed = threading.RLock(), threading.Event()
         self._publisher = RobotPublisher(node, config)
         self._create_readers(node)
@@ -81,11 +82,12 @@ class RobotLocalizer:
     ) -> QueryAnswer:
         """Localize the next image and publish its pose. Raises as `QueryFrame.localize`."""
         if frame.t_ns < self._last_ns:
-            self._reset()
+            self._reset(frame.t_ns)
             tracker.reset()
-        self._last_ns = frame.t_ns
+        self._last_ns, self._num_answers = frame.t_ns, self._num_answers + 1
         self._clock.observe(frame.t_ns)
         self._report("clock", self._clock.describe_fault())
+        self._report("load", self._describe_load())
         self._odometry = odometry = self._find_odometry(frame.t_ns)
         if odometry is not None:
             frame = replace(frame, odom_from_cam=odometry.odom_from_cam)
@@ -130,14 +132,25 @@ class RobotLocalizer:
             return
         self._user_pose = message
 
-    def _reset(self) -> None:
+    def _reset(self, t_ns: int) -> None:
         """Start again, because the clock was set back."""
         with self._lock:
             self._gate.reset()
             self._map_to_odom.reset()
-            self._transforms.clear()
+            self._transforms.forget_after(t_ns)
             self._clock.reset()
             self._odometry, self._last_stamp_ns = None, 0
+
+    def _describe_load(self) -> str | None:
+        """Return a sentence if images come twice as fast as answers, or faster."""
+        dropped, answered = self._images.num_dropped if self._images else 0, self._num_answers
+        least = 100  # answers; the first ones take longer
+        if answered < least or dropped < answered:
+            return None
+        return (
+            f"images come faster than answers ({dropped} of {dropped + answered} dropped); lower"
+            " the rate of the camera or the size of its images"
+        )
 
     def _find_odometry(self, t_ns: int) -> Odometry | None:
         """Return the odometry at the time of an image, None if there is none."""
@@ -192,9 +205,10 @@ class RobotLocalizer:
         health.answer_at = time.monotonic()
 
     def _measured_pose(self, answer: StreamedPose) -> tuple[Uncertain | None, float]:
-        """Return map_from_cam and its probability. None of a pose that is only predicted."""
+        """Return map_from_cam and its probability. None of a pose that is only predicted, or of an
+        image that a camera repeats."""
         result = answer.result
-        if not isinstance(result, Localization):
+        if not isinstance(result, Localization) or answer.is_repeated:
             return None, 0.0
         pose, covariance = result.world_from_cam, result.covariance
         if answer.smoothed is not None and answer.smoothed_covariance is not None:
@@ -238,12 +252,13 @@ class RobotLocalizer:
         self._report("tilt", text if angle > limit else None)
 
     def _send_map_to_odom(self) -> None:
-        """Publish the transform, stamped ahead. Its stamps increase."""
-        ahead_ns = round(1e9 * self._config.transform_tolerance)
+        """Publish the transform, stamped ahead. Its stamps increase, unless the clock is set."""
+        ahead_ns, set_ns = round(1e9 * self._config.transform_tolerance), 1_000_000_000
         with self._lock:
             map_from_odom = self._map_to_odom.advance(time.monotonic())
             stamp_ns = self._clock.now_ns() + ahead_ns
-            if map_from_odom is not None and stamp_ns > self._last_stamp_ns:
+            is_later = not 0 <= self._last_stamp_ns - stamp_ns < set_ns
+            if map_from_odom is not None and is_later:
                 self._last_stamp_ns = stamp_ns
                 child = self._config.odom_frame
                 self._publisher.send_transform(stamp_ns, child, map_from_odom)

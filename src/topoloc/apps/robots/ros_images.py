@@ -3,12 +3,13 @@ topic `camera_info` beside it."""
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from topoloc import CalibrationError, Camera, StereoFrame
+from topoloc import CalibrationError, Camera, RecordingError, StereoFrame
 from topoloc.apps.cli.queries.query_answers import QueryFrame
 from topoloc.apps.formats.bags.bag_images import camera_info, decode_image, reduce_to_part
 from topoloc.apps.formats.bags.messages import frame_id, stamp_ns
@@ -29,13 +30,19 @@ class RosImages:
     Args:
         source: `ros:` and the topic. One that ends with /compressed has JPEG or PNG images.
         has_camera: the camera is given, and camera_info is not needed.
-        warn: gets one line if images or their calibration do not come.
+        warn: gets one line if no images come.
+
+    Raises RecordingError: the source names no topic.
     """
 
     def __init__(
         self, node: RosNode, source: str, has_camera: bool, warn: Callable[[str], None]
     ) -> None:
-        messages, self.topic = node.messages, source.removeprefix(PREFIX)
+        messages, self.topic = node.messages, f"/{source.removeprefix(PREFIX).lstrip('/')}"
+        if not re.fullmatch(r"(/[A-Za-z]\w*)+", self.topic, re.ASCII):
+            raise RecordingError(
+                f"{source[:80]}: no topic of ROS; ros:/camera/image_raw is expected"
+            )
         kind = messages.Image
         if self.topic.endswith(_COMPRESSED):
             kind = messages.CompressedImage

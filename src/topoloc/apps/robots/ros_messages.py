@@ -13,11 +13,13 @@ from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
 
 if TYPE_CHECKING:
-    Covariance = Matrix3x3 = Matrix3x4 = Distortion = list[float]
+    Covariance = list[float]
+    Matrix3x3 = list[float]
+    Matrix3x4 = list[float]
     Bytes = bytes
 else:
     Covariance, Matrix3x3, Matrix3x4 = (array[float64, size] for size in (36, 9, 12))
-    Distortion, Bytes = sequence[float64], sequence[uint8]
+    Bytes = sequence[uint8]
 
 
 @dataclass
@@ -130,7 +132,7 @@ class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
     height: uint32
     width: uint32
     distortion_model: str
-    d: Distortion
+    d: sequence[float64]
     k: Matrix3x3
     r: Matrix3x3
     p: Matrix3x4

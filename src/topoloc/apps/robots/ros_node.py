@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Literal
 
 from topoloc import MissingExtraError, TopolocError
@@ -93,7 +94,8 @@ class RosNode:
             self._waitset.wait(50_000_000)
             for reader, callback in self._callbacks:
                 for message in take(reader, 100):
-                    callback(message)
+                    with suppress(ValueError, TypeError, OverflowError, TopolocError):
+                        callback(message)  # of a message whose numbers mean nothing
 
     def _quality(self, quality: Quality) -> Any:
         """Return the QoS: that of sensor data, that of most topics, or that of /tf_static."""
@@ -111,8 +113,17 @@ class RosNode:
 
 
 def take(reader: Any, num: int) -> list[Any]:
-    """Return the messages that have arrived, at most `num`."""
-    return [one for one in reader.take(num) if one.sample_info.valid_data]
+    """Return the messages that have arrived, at most `num`. Damaged ones are left out."""
+    messages = list[Any]()
+    for _ in range(num):
+        try:
+            taken = reader.take(1)
+        except Exception:  # decoders raise many classes for damaged bytes
+            continue
+        if not taken:
+            break
+        messages += [one for one in taken if one.sample_info.valid_data]
+    return messages
 
 
 def _find_domain(config: RobotConfig) -> int:

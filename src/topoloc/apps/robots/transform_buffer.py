@@ -73,10 +73,13 @@ class TransformBuffer:
                 edge.add(one.t_ns, pose_of_transform(one))
             self._changed.notify_all()
 
-    def clear(self) -> None:
-        """Forget the transforms that move."""
+    def forget_after(self, t_ns: int) -> None:
+        """Forget later transforms, because the clock was set back to this time."""
         with self._changed:
-            self._edges = {name: edge for name, edge in self._edges.items() if edge.is_static}
+            for edge in self._edges.values():
+                if not edge.is_static:
+                    end = bisect.bisect_right(edge.t_ns, t_ns)
+                    del edge.t_ns[end:], edge.poses[end:]
 
     def look_up(self, target: str, source: str, t_ns: int, wait_s: float = 0.0) -> Rigid3:
         """Return target_from_source at a time. Wait up to `wait_s` for its transforms. Raises
@@ -119,8 +122,8 @@ class TransformBuffer:
             edge = self._edges[child]
             step = edge.pose_at(t_ns)
             if step is None:
-                late = (edge.t_ns[-1] - t_ns) / 1e9
-                span = f"the newest is {-late:.2f} s older" if late < 0 else "all are newer"
+                age = (t_ns - edge.t_ns[-1]) / 1e9 if edge.t_ns else 0.0
+                span = f"the newest is {age:.2f} s older" if age > 0 else "all are newer"
                 raise TransformError(
                     f"no transform from {edge.parent} to {child} at the time of the image,"
                     f" {span}; check its publisher and the clocks"
