@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from topoloc.apps.robots.config import RobotConfig
-from topoloc.apps.robots.health_gate import Evidence, HealthGate
+from topoloc.apps.robots.map_to_odom import Evidence, HealthGate
 from topoloc.geometry.rigid import Rigid3
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])

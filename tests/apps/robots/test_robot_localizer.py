@@ -15,8 +15,7 @@ from topoloc.apps.cli.queries.query_answers import QueryAnswer, QueryFrame
 from topoloc.apps.robots import robot_localizer
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.robot_localizer import RobotLocalizer
-from topoloc.apps.robots.robot_publisher import RobotPublisher
-from topoloc.apps.robots.ros_node import RosNode
+from topoloc.apps.robots.ros_node import RobotPublisher, RosNode
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.node_ids import NodeId
@@ -41,8 +40,8 @@ class Publisher(RobotPublisher):
     def send_pose(self, t_ns: int, pose: Rigid3, covariance: np.ndarray) -> None:
         self.poses.append((t_ns, pose))
 
-    def send_transform(self, t_ns: int, child: str, pose: Rigid3) -> None:
-        self.transforms.append((t_ns, child, pose))
+    def send_transform(self, t_ns: int, child: str, map_from_child: Rigid3) -> None:
+        self.transforms.append((t_ns, child, map_from_child))
 
     def send_status(self, t_ns: int, level: int, text: str, values: dict[str, str]) -> None:
         self.statuses.append((level, text, values))
@@ -59,7 +58,7 @@ class Node(RosNode):
             PoseWithCovarianceStamped=None, TFMessage=None, Clock=None, Image=None
         )
 
-    def create_reader(self, name: str, kind: Any, quality: str, callback: Any) -> None:
+    def create_reader(self, name: str, kind: Any, quality: str, callback: Any = None) -> None:
         self.heard[name] = callback
 
     def start(self) -> None:
@@ -276,6 +275,7 @@ def test_simulated_time_stamps_the_transforms(make: Callable[..., Robot]):
     robot = make(use_sim_time=True)
     robot.start_ns = 1_000_000_000
     clock = robot.node.heard["/clock"]
+    t_ns = 0
     for number in range(12):
         t_ns = robot.start_ns + 100_000_000 * number
         clock(SimpleNamespace(clock=SimpleNamespace(sec=t_ns // 10**9, nanosec=t_ns % 10**9)))

@@ -141,7 +141,7 @@ class _Valid:
 def test_covariances_are_about_the_robot():
     """Perturbations by hand: draws of the left perturbation move the robot by as much as the
     covariance about it says."""
-    from topoloc.apps.robots.robot_publisher import covariance_about
+    from topoloc.apps.robots.ros_node import covariance_about
     from topoloc.geometry.rigid import Rigid3
 
     pose = Rigid3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))

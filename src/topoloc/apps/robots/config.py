@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from topoloc.plugin import Above, AtLeast, Between
+from topoloc.plugin import AtLeast, Between
 
 
 @dataclass(frozen=True)
@@ -43,17 +43,17 @@ class RobotConfig:
     """Least probability of a pose that counts as evidence."""
     jump: Literal["at_once", "smooth"] = "at_once"
     """How the transform follows a confirmed jump. Smaller corrections are always smooth."""
-    correction_speed: Annotated[float, Above(0)] = 0.5
+    correction_speed: Annotated[float, Between(0.001, 1e6)] = 0.5
     """Metres per second by which smooth corrections move the robot."""
-    correction_turn: Annotated[float, Above(0)] = 0.5
+    correction_turn: Annotated[float, Between(0.001, 1e6)] = 0.5
     """Radians per second by which smooth corrections turn the robot."""
     odometry_error: Annotated[float, Between(0, 1)] = 0.05
     """Error of the odometry, as a share of the way and of the rotation (one sigma)."""
-    warn_after: Annotated[float, Above(0)] = 1.0
+    warn_after: Annotated[float, Between(0.001, 1e6)] = 1.0
     """Seconds without evidence after which /diagnostics says WARN."""
-    lost_after: Annotated[float, Above(0)] = 10.0
+    lost_after: Annotated[float, Between(0.001, 1e6)] = 10.0
     """Seconds without evidence after which /diagnostics says ERROR."""
-    clock_offset: Annotated[float, Above(0)] = 0.5
+    clock_offset: Annotated[float, Between(0.001, 1e6)] = 0.5
     """Seconds between the stamps of images and this clock that mean another clock."""
     publish_initial_pose: bool = False
     """Publish the first confirmed pose on /initialpose once, instead of reading that topic."""

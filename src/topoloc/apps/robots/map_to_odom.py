@@ -1,14 +1,125 @@
-"""The transform from map to odom as it is published: it follows the agreed one smoothly, or at
-once."""
+"""Decide which measured poses move the transform from map to odom, and how it follows them.
+
+Only images that were matched with the map are evidence, never poses predicted by odometry. A pose
+that agrees with the present transform updates it. Poses that contradict it must agree among each
+other, by the motion that odometry measured between them, before they replace it (a jump). The
+published transform moves smoothly, or at once.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc import Rigid3
 from topoloc.apps.robots.config import RobotConfig
+
+Verdict = Literal["found", "jumped", "doubted"]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Hold the pose of an image.
+
+    Attributes:
+        t_ns: time of the image.
+        map_from_cam: measured pose.
+        covariance: that of its left perturbation.
+        odom_from_cam: pose by odometry.
+        travelled: way and rotation by odometry since the start, metres and radians.
+        is_localized: matched with the whole map. Otherwise points were tracked, whose errors are
+            those of the last such image.
+    """
+
+    t_ns: int
+    map_from_cam: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    odom_from_cam: Rigid3
+    travelled: Float[np.ndarray, "2"]
+    is_localized: bool
+
+    @property
+    def map_from_odom(self) -> Rigid3:
+        """Return the transform that this pose measures."""
+        return self.map_from_cam @ self.odom_from_cam.inverse()
+
+    @property
+    def local_covariance(self) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of the right perturbation, in axes of the camera."""
+        return self.map_from_cam.inverse().transform_covariance(self.covariance)
+
+
+class HealthGate:
+    """Hold the agreed transform from map to odom. `agreed` is its last evidence."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        self._config = config
+        self.agreed: Evidence | None = None
+        self._against: list[Evidence] = []
+        self._prior: Evidence | None = None
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Return whether the last images contradict the agreed transform."""
+        return bool(self._against)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.agreed = self._prior = None
+        self._against = []
+
+    def expect(self, prior: Evidence) -> None:
+        """Take a pose that a user gave. The next one that agrees with it is confirmed by that."""
+        self._prior = prior
+
+    def judge(self, evidence: Evidence) -> Verdict:
+        """Take the pose of an image.
+
+        Return "found" if it agrees with the transform, "jumped" if it is the last of several that
+        confirm another one, else "doubted". "doubted" poses are not to be published.
+        """
+        if self.agreed is not None and self._agree(self.agreed, evidence):
+            self.agreed, self._against = evidence, []
+            return "found"
+        if not evidence.is_localized:
+            return "doubted"
+        if self._against and not self._agree(self._against[-1], evidence):
+            self._against = []
+        self._against.append(evidence)
+        is_expected = self._prior is not None and self._agree(self._prior, evidence)
+        if not (is_expected or self._is_confirmed()):
+            return "doubted"
+        self.agreed, self._against, self._prior = evidence, [], None
+        return "jumped"
+
+    def _is_confirmed(self) -> bool:
+        config, seconds = self._config, (self._against[-1].t_ns - self._against[0].t_ns) / 1e9
+        is_jump = self.agreed is not None
+        return len(self._against) >= config.confirm_images and (
+            not is_jump or seconds >= config.confirm_seconds
+        )
+
+    def _agree(self, before: Evidence, after: Evidence) -> bool:
+        """Return whether two poses are the same but for the motion by odometry between them."""
+        metres, radians = 0.05, 0.05  # smaller differences are none
+        max_surprise = 33.0  # chi^2 of 6 degrees of freedom: 1 in 100,000
+        motion = before.odom_from_cam.inverse() @ after.odom_from_cam
+        way_and_turn = np.abs(after.travelled - before.travelled)
+        sigmas = self._config.odometry_error * np.repeat(way_and_turn, 3) + 1e-3
+        to_after = motion.inverse()
+        return (before.map_from_cam @ motion).is_same(
+            after.map_from_cam,
+            metres,
+            radians,
+            covariance=to_after.transform_covariance(before.local_covariance)
+            + after.local_covariance
+            + np.diag(sigmas**2),
+            max_square=max_surprise,
+        )
 
 
 class MapToOdom:

@@ -18,13 +18,16 @@ from topoloc.apps.formats.bags.bag_poses import pose_of_transform
 from topoloc.apps.formats.bags.messages import frame_id, stamp_ns, stamped_transform
 from topoloc.apps.query_camera import CameraOfSize
 from topoloc.apps.robots.config import RobotConfig
-from topoloc.apps.robots.diagnostics import Health
-from topoloc.apps.robots.health_gate import Evidence, HealthGate
-from topoloc.apps.robots.map_to_odom import MapToOdom, project_to_plane, tilt
-from topoloc.apps.robots.robot_clock import RobotClock
-from topoloc.apps.robots.robot_publisher import INITIAL_POSE_TOPIC, RobotPublisher, Uncertain
+from topoloc.apps.robots.map_to_odom import (
+    Evidence,
+    HealthGate,
+    MapToOdom,
+    project_to_plane,
+    tilt,
+)
+from topoloc.apps.robots.robot_health import Health, RobotClock
 from topoloc.apps.robots.ros_images import RosImages
-from topoloc.apps.robots.ros_node import RosNode
+from topoloc.apps.robots.ros_node import INITIAL_POSE_TOPIC, RobotPublisher, RosNode, Uncertain
 from topoloc.apps.robots.transform_buffer import TransformBuffer, TransformError
 
 

@@ -16,7 +16,7 @@ from topoloc.apps.formats.bags.messages import frame_id, stamp_ns
 from topoloc.apps.formats.bags.topics import is_rectified
 from topoloc.apps.robots.ros_node import RosNode, take
 
-PREFIX, _COMPRESSED = "ros:", "/compressed"
+PREFIX = "ros:"
 
 
 def is_topic(source: str) -> bool:
@@ -38,15 +38,16 @@ class RosImages:
     def __init__(
         self, node: RosNode, source: str, has_camera: bool, warn: Callable[[str], None]
     ) -> None:
-        messages, self.topic = node.messages, f"/{source.removeprefix(PREFIX).lstrip('/')}"
+        messages, compressed = node.messages, "/compressed"
+        self.topic = f"/{source.removeprefix(PREFIX).lstrip('/')}"
         if not re.fullmatch(r"(/[A-Za-z]\w*)+", self.topic, re.ASCII):
             raise RecordingError(
                 f"{source[:80]}: no topic of ROS; ros:/camera/image_raw is expected"
             )
         kind = messages.Image
-        if self.topic.endswith(_COMPRESSED):
+        if self.topic.endswith(compressed):
             kind = messages.CompressedImage
-        self.info_topic = f"{self.topic.removesuffix(_COMPRESSED).rpartition('/')[0]}/camera_info"
+        self.info_topic = f"{self.topic.removesuffix(compressed).rpartition('/')[0]}/camera_info"
         self._images = node.create_reader(self.topic, kind, "sensor")
         self._infos = None
         if not has_camera:

@@ -1,9 +1,14 @@
-"""The time of the robot: this machine's, that of /clock, or that of another machine's stamps."""
+"""The time of the robot (this machine's, that of /clock, or that of another machine's stamps), and
+what /diagnostics says about the localization: level, one sentence, and figures."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
+from dataclasses import dataclass, field
+
+from topoloc.apps.robots.config import RobotConfig
 
 
 class RobotClock:
@@ -61,3 +66,47 @@ class RobotClock:
 
     def _local_ns(self) -> int:
         return self._simulated_ns if self._is_simulated else time.time_ns()
+
+
+@dataclass(eq=False)
+class Health:
+    """Hold the figures of the last answer. Times are seconds of any clock that goes on."""
+
+    answer_at: float = -math.inf
+    evidence_at: float = -math.inf
+    is_contradicted: bool = False
+    state: str = "lost"
+    probability: float = 0.0
+    latency_ms: float = 0.0
+    num_dropped: int = 0
+    num_jumps: int = 0
+    faults: dict[str, str] = field(default_factory=dict)
+
+    def judge(self, now: float, config: RobotConfig) -> tuple[int, str]:
+        """Return the level (0 OK, 1 WARN, 2 ERROR) and a sentence."""
+        ok, warn, error = range(3)
+        silence, fault = now - self.evidence_at, next(iter(self.faults.values()), None)
+        if math.isinf(silence):
+            return error, fault or "not localized yet"
+        if silence > config.lost_after:
+            return error, fault or f"lost: no evidence for {silence:.1f} s"
+        if fault is not None:
+            return warn, fault
+        if self.is_contradicted:
+            return warn, "the images contradict the pose"
+        if silence > config.warn_after:
+            return warn, f"no evidence for {silence:.1f} s; the pose is that of odometry"
+        return ok, "localized"
+
+    def values(self, now: float, offset: float) -> dict[str, str]:
+        """Return the figures as texts. `offset` is that of the clock, seconds."""
+        return {
+            "state": self.state,
+            "probability": f"{self.probability:.3f}",
+            "latency_ms": f"{self.latency_ms:.0f}",
+            "dropped_images": f"{self.num_dropped}",
+            "answer_age_s": f"{now - self.answer_at:.2f}",
+            "evidence_age_s": f"{now - self.evidence_at:.2f}",
+            "clock_offset_s": f"{offset:.3f}",
+            "jumps": f"{self.num_jumps}",
+        }
