@@ -110,9 +110,11 @@ class PlayedRobot:
         return False
 
     def stand(self, step: Step, until: Callable[[], bool], seconds: float) -> bool:
-        """Play a step until something is heard."""
+        """Play a step until something is heard, and then half a second more."""
         end = time.monotonic() + seconds
         while not until() and time.monotonic() < end:
+            self.play([step] * 5)
+        if until():
             self.play([step] * 5)
         return until()
 
@@ -210,6 +212,8 @@ class PlayedRobot:
             row = width * (1 if shown.ndim == 2 else 3)
             image = ros.Image(header, height, width, encoding, 0, row, shown.tobytes())
             rotation = np.eye(3).ravel().tolist()
+            data = image.serialize()  # before its time, since a driver does this at once
+            image.serialize = lambda *_, data=data, **__: data
             _sleep_until(t_ns)
             self._info(
                 ros.CameraInfo(

@@ -6,8 +6,9 @@ of a topic. Needs `cyclonedds`, the extra `ros`.
 """
 
 # No `from __future__ import annotations`: cyclonedds reads the types of the fields as they are.
+import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
@@ -100,6 +101,18 @@ class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
 
 
 @dataclass
+class ImageHead(IdlStruct, typename="topoloc::ImageHead_"):
+    """The fields of an image before its data."""
+
+    header: Header
+    height: uint32
+    width: uint32
+    encoding: str
+    is_bigendian: uint8
+    step: uint32
+
+
+@dataclass
 class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
     header: Header
     height: uint32
@@ -108,6 +121,16 @@ class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
     is_bigendian: uint8
     step: uint32
     data: Bytes
+
+    @classmethod
+    def deserialize(cls, data: bytes, has_header: bool = True, use_version_2: Any = None) -> Self:
+        # cyclonedds makes a list of the bytes, which takes longer than tracking an image.
+        head = ImageHead.deserialize(data, has_header, use_version_2)
+        start = len(head.serialize())  # it ends with a number of 4 bytes, as the length is
+        (size,) = struct.unpack_from("<I" if data[1] & 1 else ">I", data, start)
+        shape = head.header, head.height, head.width
+        layout = head.encoding, head.is_bigendian, head.step
+        return cls(*shape, *layout, bytes(data[start + 4 : start + 4 + size]))
 
 
 @dataclass
