@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,6 +83,14 @@ def test_a_jump_is_believed_after_a_second_of_images_that_agree(gate: HealthGate
     assert gate.agreed is not None
     expected = AWAY @ MAP_FROM_ODOM
     assert np.allclose(gate.agreed.map_from_odom.matrix(), expected.matrix(), atol=1e-9)
+
+
+def test_a_robot_that_stands_waits_longer(gate: HealthGate):
+    """Its images are the same, and so are their errors."""
+    first = _evidence(1.0, AWAY)
+    standing = [replace(first, t_ns=first.t_ns + 200_000_000 * k) for k in range(27)]
+    verdicts = _verdicts(gate, standing)
+    assert verdicts == "d" * 25 + "jf"
 
 
 def test_images_that_odometry_contradicts_confirm_no_jump(gate: HealthGate):

@@ -58,7 +58,7 @@ class Node(RosNode):
             PoseWithCovarianceStamped=None, TFMessage=None, Clock=None, Image=None
         )
 
-    def create_reader(self, name: str, kind: Any, quality: str, callback: Any = None) -> None:
+    def create_reader(self, name: str, kind: Any, quality: str, callback: Any = None) -> Any:
         self.heard[name] = callback
 
     def start(self) -> None:

@@ -110,7 +110,7 @@ def test_without_a_network_one_sentence_says_so(monkeypatch: pytest.MonkeyPatch)
 def test_a_damaged_message_costs_only_itself():
     """Another participant sends bytes of another type under the same name: an image whose data are
     as long as the text of a shorter message says."""
-    from topoloc.apps.robots.ros_node import take
+    from topoloc.apps.robots.ros_node import TopicReader
 
     class Reader:
         def __init__(self) -> None:
@@ -129,7 +129,7 @@ def test_a_damaged_message_costs_only_itself():
                 return [one]
             raise one if isinstance(one, Exception) else struct.error
 
-    assert [one.number for one in take(Reader(), 10)] == [3, 4]
+    assert [one.number for one in TopicReader(Reader()).take(10)] == [3, 4]
 
 
 class _Valid:

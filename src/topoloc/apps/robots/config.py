@@ -38,7 +38,7 @@ class RobotConfig:
     confirm_images: Annotated[int, Between(1, 1000)] = 3
     """Localized images that must agree by odometry before the first pose or a jump is published."""
     confirm_seconds: Annotated[float, AtLeast(0)] = 1.0
-    """Seconds for which images must agree on a jump."""
+    """Seconds for which images must agree on a jump, five times as long if the robot stands."""
     min_probability: Annotated[float, Between(0, 1)] = 0.8
     """Least probability of a pose that counts as evidence."""
     jump: Literal["at_once", "smooth"] = "at_once"

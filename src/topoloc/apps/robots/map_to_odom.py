@@ -97,11 +97,14 @@ class HealthGate:
         return "jumped"
 
     def _is_confirmed(self) -> bool:
-        config, seconds = self._config, (self._against[-1].t_ns - self._against[0].t_ns) / 1e9
-        is_jump = self.agreed is not None
-        return len(self._against) >= config.confirm_images and (
-            not is_jump or seconds >= config.confirm_seconds
-        )
+        first, last = self._against[0], self._against[-1]
+        if len(self._against) < self._config.confirm_images or self.agreed is None:
+            return len(self._against) >= self._config.confirm_images
+        # Images of a robot that stands (metres and radians) have the same errors.
+        still, times_as_long = 0.1, 5.0
+        is_still = bool(np.all(last.travelled - first.travelled < still))
+        seconds = self._config.confirm_seconds * (times_as_long if is_still else 1.0)
+        return last.t_ns - first.t_ns >= seconds * 1e9
 
     def _agree(self, before: Evidence, after: Evidence) -> bool:
         """Return whether two poses are the same but for the motion by odometry between them."""

@@ -268,12 +268,13 @@ class RobotLocalizer:
 
     def _repeat(self) -> None:
         """Publish the transform and the diagnostics again and again; runs in the thread."""
-        interval, due = 1.0, 0.0  # seconds between diagnostics
+        interval, due, before = 1.0, 0.0, None  # seconds between diagnostics of one level
         while not self._is_closed.wait(1.0 / self._config.rate):
             self._send_map_to_odom()
-            if (now := time.monotonic()) >= due:
-                due = now + interval
-                level, text = self._health.judge(now, self._config)
+            now = time.monotonic()
+            level, text = self._health.judge(now, self._config)
+            if now >= due or level != before:
+                due, before = now + interval, level
                 values = self._health.values(now, self._clock.offset)
                 self._publisher.send_status(self._clock.now_ns(), level, text, values)
 

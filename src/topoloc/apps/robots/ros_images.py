@@ -14,7 +14,7 @@ from topoloc.apps.cli.queries.query_answers import QueryFrame
 from topoloc.apps.formats.bags.bag_images import camera_info, decode_image, reduce_to_part
 from topoloc.apps.formats.bags.messages import frame_id, stamp_ns
 from topoloc.apps.formats.bags.topics import is_rectified
-from topoloc.apps.robots.ros_node import RosNode, take
+from topoloc.apps.robots.ros_node import RosNode
 
 PREFIX = "ros:"
 
@@ -64,7 +64,7 @@ class RosImages:
         patience, set_back_ns = 10.0, 1_000_000_000  # seconds without an image; nanoseconds
         since, number, last_ns = time.monotonic(), 0, 0
         while not stop.is_set():
-            arrived = take(self._images, 5)
+            arrived = self._images.take(5)
             newer = [one for one in arrived if stamp_ns(one.header.stamp) > last_ns]
             if arrived and stamp_ns(arrived[-1].header.stamp) < last_ns - set_back_ns:
                 newer = arrived[-1:]
@@ -102,7 +102,7 @@ class RosImages:
         wait_s = 5.0
         end = time.monotonic() + wait_s
         while True:
-            for info in take(self._infos, 5):
+            for info in self._infos.take(5):
                 self._last_info = info
             if self._last_info is not None or stop.is_set():
                 break

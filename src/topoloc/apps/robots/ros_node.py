@@ -21,6 +21,26 @@ Uncertain = tuple[Rigid3, Float[np.ndarray, "6 6"]]
 """A pose and the covariance of its left perturbation."""
 
 
+class TopicReader:
+    """The messages of a topic that have arrived. `reader` is that of DDS."""
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+
+    def take(self, num: int) -> list[Any]:
+        """Return the messages that have arrived, at most `num`. Damaged ones are left out."""
+        messages = list[Any]()
+        for _ in range(num):
+            try:
+                taken = self._reader.take(1)
+            except Exception:  # decoders raise many classes for damaged bytes
+                continue
+            if not taken:
+                break
+            messages += [one for one in taken if one.sample_info.valid_data]
+        return messages
+
+
 class RosNode:
     """A participant of a ROS 2 domain until it is closed.
 
@@ -43,7 +63,7 @@ class RosNode:
                 f"ROS domain {self.domain}: DDS has no network here; connect one, or name an"
                 " interface in CYCLONEDDS_URI"
             ) from None
-        self._callbacks: list[tuple[Any, Callable[[Any], None]]] = []
+        self._callbacks: list[tuple[TopicReader, Callable[[Any], None]]] = []
         self._waitset = core.WaitSet(self._participant)
         self._is_closed = threading.Event()
         self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
@@ -68,7 +88,7 @@ class RosNode:
         kind: Any,
         quality: Quality,
         callback: Callable[[Any], None] | None = None,
-    ) -> Any:
+    ) -> TopicReader:
         """Return a reader. `callback` gets each message, in the thread of `start`."""
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
@@ -80,8 +100,8 @@ class RosNode:
             states = core.ViewState.Any | core.InstanceState.Alive | core.SampleState.NotRead
             condition = core.ReadCondition(reader, states)
             self._waitset.attach(condition)
-            self._callbacks.append((reader, callback))
-        return reader
+            self._callbacks.append((TopicReader(reader), callback))
+        return TopicReader(reader)
 
     def start(self) -> None:
         """Begin to call back."""
@@ -99,7 +119,7 @@ class RosNode:
         while not self._is_closed.is_set():
             self._waitset.wait(50_000_000)
             for reader, callback in self._callbacks:
-                for message in take(reader, 100):
+                for message in reader.take(100):
                     with suppress(ValueError, TypeError, OverflowError, TopolocError):
                         callback(message)  # of a message whose numbers mean nothing
 
@@ -116,20 +136,6 @@ class RosNode:
         if quality == "latched":
             return Qos(reliable, history, Policy.Durability.TransientLocal, ignored)
         return Qos(reliable, history, ignored)
-
-
-def take(reader: Any, num: int) -> list[Any]:
-    """Return the messages that have arrived, at most `num`. Damaged ones are left out."""
-    messages = list[Any]()
-    for _ in range(num):
-        try:
-            taken = reader.take(1)
-        except Exception:  # decoders raise many classes for damaged bytes
-            continue
-        if not taken:
-            break
-        messages += [one for one in taken if one.sample_info.valid_data]
-    return messages
 
 
 def _find_domain(config: RobotConfig) -> int:
