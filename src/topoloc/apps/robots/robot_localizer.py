@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -67,6 +68,7 @@ class RobotLocalizer:
         self._odometry: Odometry | None = None
         self._user_pose: Any = None
         self._last_ns = self._last_stamp_ns = self._num_answers = 0
+        self._sent_ns = deque[int](maxlen=200)  # the stamps of its own transforms
         self._warned = set[str]()
         self._lock, self._is_closed = threading.RLock(), threading.Event()
         self._publisher = RobotPublisher(node, config)
@@ -115,7 +117,7 @@ class RobotLocalizer:
     def _take_transforms(self, message: Any) -> None:
         transforms = [stamped_transform(one) for one in message.transforms]
         odom_frame = self._config.odom_frame
-        if any(one.child == odom_frame for one in transforms):
+        if any(one.child == odom_frame and one.t_ns not in self._sent_ns for one in transforms):
             text = f"another node publishes TF to {odom_frame}; stop it, or name the frames"
             self._report("rival", text)
         self._transforms.add(transforms, is_static=False)
@@ -263,6 +265,7 @@ class RobotLocalizer:
             is_later = not 0 <= self._last_stamp_ns - stamp_ns < set_ns
             if map_from_odom is not None and is_later:
                 self._last_stamp_ns = stamp_ns
+                self._sent_ns.append(stamp_ns)
                 child = self._config.odom_frame
                 self._publisher.send_transform(stamp_ns, child, map_from_odom)
 

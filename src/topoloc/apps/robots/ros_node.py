@@ -131,11 +131,10 @@ class RosNode:
         if quality == "sensor":
             return Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(5))
         reliable = Policy.Reliability.Reliable(duration(milliseconds=100))
-        ignored = Policy.IgnoreLocal.Participant
         history = Policy.History.KeepLast(100)
         if quality == "latched":
-            return Qos(reliable, history, Policy.Durability.TransientLocal, ignored)
-        return Qos(reliable, history, ignored)
+            return Qos(reliable, history, Policy.Durability.TransientLocal)
+        return Qos(reliable, history)
 
 
 def _find_domain(config: RobotConfig) -> int:
