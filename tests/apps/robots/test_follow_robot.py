@@ -13,6 +13,10 @@ import pytest
 pytest.importorskip("cyclonedds", reason="the extra ros is not installed")
 from played_robot import BASE_FROM_CAM, PlayedRobot, Step, followed
 from tiny_world import CAMERA, path_pose, render, room
+from topoloc.demo.recordings import SHIPPED
+from topoloc.localization.map_facts.map_building import build_map
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import as_monocular
 
 DOMAIN = 100 + os.getpid() % 100  # tests run side by side
 START_S = 150.0  # kernels may have to be compiled
@@ -116,3 +120,39 @@ def test_without_odometry_tf_is_that_of_the_camera(robot: PlayedRobot, room_map:
     assert np.linalg.norm(pose.translation - camera.translation) < 0.05
     assert np.allclose(robot.heard.poses[-1][2].matrix(), pose.matrix(), atol=1e-9)
     assert np.linalg.norm(BASE_FROM_CAM.translation) > 0.4  # it is not the robot's
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["lab", "kitchen"])
+def test_tf_is_right_in_the_demos_lab_and_in_a_real_kitchen(
+    request: pytest.FixtureRequest, place: str, tmp_path: Path
+):
+    """The lab in its own time, two images a second and 0.26 m apart. The kitchen of 7-Scenes, whose
+    truth is that of a tracker; one frame in four is mapped, and others are played."""
+    if place == "lab":
+        mapped = [str(SHIPPED / "map_lap1"), str(SHIPPED / "map_lap2")]
+        played, hz = str(SHIPPED / "day"), 1.92
+    else:
+        kitchen = request.getfixturevalue("shared") / "data" / "seven_scenes" / "kitchen" / "seq-01"
+        if not kitchen.is_dir():
+            pytest.skip(f"no recording at {kitchen}")
+        mapped, played, hz = [f"{kitchen}@0::4"], f"{kitchen}@2::4", 10.0
+    build_map([open_sequence(path) for path in mapped]).save(tmp_path / "place.topo")
+    sequence, steps = as_monocular(open_sequence(played)), list[Step]()
+    for frame in (sequence[index] for index in range(min(len(sequence), 120))):
+        assert frame.world_from_cam is not None
+        steps.append(Step(frame.world_from_cam, frame.image))
+    camera = sequence[0].camera
+    assert camera is not None
+    robot = PlayedRobot(camera, DOMAIN, hz)
+    with followed(tmp_path / "place.topo", DOMAIN, "--ros") as process:
+        _start(robot, steps[0])
+        robot.play(steps)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+    errors, poses = robot.errors(0, len(steps) - 2), robot.pose_errors()
+    robot.close()
+    assert np.median(errors) < 0.02
+    assert errors.max() < 0.3
+    assert len(poses) > 0.5 * len(steps)
+    assert poses.max() < 0.3
