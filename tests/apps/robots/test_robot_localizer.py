@@ -302,3 +302,47 @@ def test_another_localizer_is_named(make: Callable[..., Robot]):
     robot = make()
     robot.node.tf(robot.start_ns, "map", "odom", MAP_FROM_ODOM)
     assert robot.warnings == ["another node publishes TF to odom; stop it, or name the frames"]
+
+
+@pytest.mark.parametrize("jump", ["at_once", "smooth"])
+def test_after_a_kidnapping_it_moves_at_once_or_smoothly(make: Callable[..., Robot], jump: str):
+    robot = make(jump=jump, correction_speed=0.1)
+    for number in range(4):
+        robot.see(number)
+    away = Rigid3.exp(np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0]))
+    for number in range(4, 16):
+        robot.see(number, wrong=away)
+    _, _, pose = robot.published.transforms[-1]
+    moved = np.linalg.norm(pose.translation - MAP_FROM_ODOM.translation)
+    assert moved == pytest.approx(2.0) if jump == "at_once" else moved < 0.5
+    time.sleep(0.3)
+    later = robot.published.transforms[-1][2]
+    assert np.linalg.norm(later.translation - MAP_FROM_ODOM.translation) >= moved
+    level, text, values = robot.published.statuses[-1]
+    assert (level, text, values["jumps"]) == (0, "localized", "1")
+
+
+def test_without_odometry_each_measured_pose_is_that_of_the_camera(make: Callable[..., Robot]):
+    robot = make(odom_frame="none")
+    robot.see(0)
+    robot.see(1, state="predicted", result=NotLocalized("too_few_matches"))
+    (t_ns, child, pose) = robot.published.transforms[0]
+    assert (t_ns, child, len(robot.published.poses)) == (robot.start_ns, "topoloc_camera", 1)
+    expected = MAP_FROM_ODOM @ BASE_FROM_CAM
+    assert np.allclose(pose.matrix(), expected.matrix(), atol=1e-9)
+    assert "/tf" not in robot.node.heard
+
+
+def test_images_faster_than_answers_are_one_warning(make: Callable[..., Robot]):
+    robot = make(tf_wait=0.0)
+    images: Any = SimpleNamespace(num_dropped=250, frame_id="topoloc_camera")
+    robot.localizer._images = images
+    for number in range(110):
+        robot.see(number)
+    (line,) = [one for one in robot.warnings if "clock" not in one]  # it plays ahead of the time
+    assert line.startswith("images come faster than answers (250 of 350 dropped)")
+
+
+def test_an_initial_pose_is_published_or_heard(make: Callable[..., Robot]):
+    assert "initialpose" in make().node.heard
+    assert "initialpose" not in make(publish_initial_pose=True).node.heard

@@ -189,3 +189,12 @@ def test_the_node_keeps_the_newest_messages(node_module: Any):
     assert reader.take(5) == [3, 4, 5, 6, 7]
     assert reader.take(5) == []
     assert node.domain == 7
+
+
+def test_an_initial_pose_is_published_once(node_module: Any):
+    topics, config = Topics(), RobotConfig(publish_initial_pose=True)
+    publisher = RobotPublisher(node_module.RclpyNode(topics), config)
+    for number in range(3):
+        publisher.send_pose(number, Rigid3.identity(), np.eye(6))
+    (initial,) = topics.sent["initialpose"]
+    assert initial is topics.sent["topoloc/pose"][0]
