@@ -79,14 +79,13 @@ class PlayedRobot:
         self._node = RosNode(RobotConfig(domain=domain))
         self.ros = ros = self._node.messages
         create = self._node.create_writer
-        self._image, self._info = (
-            create(IMAGE_TOPIC, ros.Image),
-            create("/camera/camera_info", ros.CameraInfo),
-        )
+        self._image = self._create_own_writer(IMAGE_TOPIC, ros.Image, "reliable")
+        self._info = create("/camera/camera_info", ros.CameraInfo)
         self._tf = create("/tf", ros.TFMessage)
         self.initial_pose = create("/initialpose", ros.PoseWithCovarianceStamped)
-        self._static = self._create_static_writer()
-        self._static(self._message([(*edge, pose) for edge, pose in STATIC.items()], 0))
+        # Later readers get its last message as well.
+        self._static = self._create_own_writer("/tf_static", ros.TFMessage, "latched")
+        self._static.write(self._message([(*edge, pose) for edge, pose in STATIC.items()], 0))
         read = self._node.create_reader
         read("/tf", ros.TFMessage, "reliable", self._hear_tf)
         read("/topoloc/pose", ros.PoseWithCovarianceStamped, "reliable", self._hear_pose)
@@ -103,8 +102,7 @@ class PlayedRobot:
         """Wait until somebody reads the images."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            writer: Any = self._image
-            if writer.__self__.get_matched_subscriptions():
+            if self._image.get_matched_subscriptions():
                 return True
             time.sleep(0.05)
         return False
@@ -221,17 +219,15 @@ class PlayedRobot:
                     0, 0, roi,
                 )
             )  # fmt: skip
-            self._image(image)
+            self._image.write(image)
 
-    def _create_static_writer(self) -> Callable[[Any], None]:
-        """Return the writer of /tf_static, whose last message later readers get as well."""
+    def _create_own_writer(self, name: str, kind: Any, quality: Any) -> Any:
         from cyclonedds.pub import DataWriter
         from cyclonedds.topic import Topic
 
-        qos = self._node._quality("latched")
-        participant = self._node._participant
-        topic = Topic(participant, "rt/tf_static", self.ros.TFMessage, qos=qos)
-        return DataWriter(participant, topic, qos=qos).write
+        qos, participant = self._node._quality(quality), self._node._participant
+        topic = Topic(participant, self._node.topic_name(name), kind, qos=qos)
+        return DataWriter(participant, topic, qos=qos)
 
     def _message(self, edges: Sequence[tuple[str, str, Rigid3]], t_ns: int) -> Any:
         ros, stamp = self.ros, self.ros.Time(*divmod(t_ns, 1_000_000_000))

@@ -138,6 +138,24 @@ class _Valid:
         self.sample_info = type("Info", (), {"valid_data": True})()
 
 
+def test_a_reader_that_hangs_ends_no_writer(monkeypatch: pytest.MonkeyPatch):
+    from cyclonedds.core import DDSException
+    from cyclonedds.pub import DataWriter
+
+    calls = list[Any]()
+
+    def write(self: Any, sample: Any) -> None:
+        calls.append(sample)
+        raise DDSException(DDSException.DDS_RETCODE_TIMEOUT)
+
+    node = RosNode(RobotConfig(domain=77))
+    publish = node.create_writer("/clock", node.messages.Clock)
+    monkeypatch.setattr(DataWriter, "write", write)
+    publish("now")
+    assert calls == ["now"]
+    node.close()
+
+
 def test_covariances_are_about_the_robot():
     """Perturbations by hand: draws of the left perturbation move the robot by as much as the
     covariance about it says."""

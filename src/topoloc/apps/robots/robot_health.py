@@ -85,7 +85,8 @@ class Health:
     def judge(self, now: float, config: RobotConfig) -> tuple[int, str]:
         """Return the level (0 OK, 1 WARN, 2 ERROR) and a sentence."""
         ok, warn, error = range(3)
-        silence, fault = now - self.evidence_at, next(iter(self.faults.values()), None)
+        silence, faults = now - self.evidence_at, tuple(self.faults.values())  # of other threads
+        fault = faults[0] if faults else None
         if math.isinf(silence):
             return error, fault or "not localized yet"
         if silence > config.lost_after:

@@ -117,7 +117,9 @@ class RobotLocalizer:
     def _take_transforms(self, message: Any) -> None:
         transforms = [stamped_transform(one) for one in message.transforms]
         odom_frame = self._config.odom_frame
-        if any(one.child == odom_frame and one.t_ns not in self._sent_ns for one in transforms):
+        with self._lock:
+            sent = set(self._sent_ns)
+        if any(one.child == odom_frame and one.t_ns not in sent for one in transforms):
             text = f"another node publishes TF to {odom_frame}; stop it, or name the frames"
             self._report("rival", text)
         self._transforms.add(transforms, is_static=False)

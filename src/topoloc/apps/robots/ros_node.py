@@ -74,13 +74,19 @@ class RosNode:
         return f"rt/{name[1:] if name.startswith('/') else inside}"
 
     def create_writer(self, name: str, kind: Any) -> Callable[[Any], None]:
-        """Return a function that publishes a message, reliably."""
+        """Return a function that publishes a message, reliably, but for readers that hang."""
         from cyclonedds.pub import DataWriter
         from cyclonedds.topic import Topic
 
         qos = self._quality("reliable")
         topic = Topic(self._participant, self.topic_name(name), kind, qos=qos)
-        return DataWriter(self._participant, topic, qos=qos).write
+        writer = DataWriter(self._participant, topic, qos=qos)
+
+        def write(message: Any) -> None:
+            with suppress(self._core.DDSException):
+                writer.write(message)
+
+        return write
 
     def create_reader(
         self,

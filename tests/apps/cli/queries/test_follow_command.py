@@ -91,4 +91,8 @@ def test_what_cannot_be_followed_is_one_line(complaint: Callable[..., str], room
 
 def test_options_of_robots_need_ros(complaint: Callable[..., str], room_map: Path):
     assert "--planar needs --ros" in complaint("follow", room_map, "0", "--planar", status=2)
+    both = ("--ros", "--planar", "--odom", "none")
+    assert "--planar is of a robot with odometry" in complaint(
+        "follow", room_map, "0", *both, status=2
+    )
     assert "--odom needs --ros" in complaint("follow", room_map, "0", "--odom", "none", status=2)

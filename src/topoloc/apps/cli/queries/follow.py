@@ -114,11 +114,11 @@ class Command:
         ]
         if given and not self.ros:
             raise UsageError(f"{given[0]} needs --ros")
-        return replace(
-            config,
-            odom_frame=self.odom or config.odom_frame,
-            planar=self.planar or config.planar,
-        )
+        frame, is_planar = self.odom or config.odom_frame, self.planar or config.planar
+        config = replace(config, odom_frame=frame, planar=is_planar)
+        if config.planar and not config.has_odometry:
+            raise UsageError("--planar is of a robot with odometry; leave out --odom none")
+        return config
 
 
 def _read_frames(sequence: StereoSequence) -> Iterator[QueryFrame]:
