@@ -139,7 +139,7 @@ class _Expecting(Tracker):
         t_ns: int,
         odom_from_cam: Rigid3 | None = None,
     ) -> None:
-        assert covariance.shape == (6, 6)
+        assert np.linalg.eigvalsh(covariance).min() > 0.0
         self.expected.append(world_from_cam)
 
     def reset(self) -> None:
@@ -235,7 +235,9 @@ def test_missing_tf_is_one_warning_and_an_error_of_diagnostics(make: Callable[..
     assert (level, text, values["state"]) == (2, line, "localized")
 
 
-def test_a_pose_of_the_user_is_a_prior(make: Callable[..., Robot]):
+@pytest.mark.parametrize("height", [0.0, float("nan"), float("inf"), -1.0])
+def test_a_pose_of_the_user_is_a_prior(make: Callable[..., Robot], height: float):
+    """Whatever its tool gives as the variance of what it does not know."""
     world = Rigid3.exp(np.array([3.0, 0.0, 1.0, 1.0, 0.5, 0.0]))
     robot = make(world)
     given = MAP_FROM_ODOM @ robot.base(0)
@@ -244,7 +246,7 @@ def test_a_pose_of_the_user_is_a_prior(make: Callable[..., Robot]):
         pose=SimpleNamespace(
             position=message.transform.translation, orientation=message.transform.rotation
         ),
-        covariance=np.diag([0.25, 0.25, 0.0, 0.0, 0.0, 0.07]).ravel().tolist(),
+        covariance=np.diag([0.25, 0.25, height, 0.0, 0.0, 0.07]).ravel().tolist(),
     )
     del message.transform
     robot.node.heard["initialpose"](message)
@@ -324,6 +326,7 @@ def test_after_a_kidnapping_it_moves_at_once_or_smoothly(make: Callable[..., Rob
 
 def test_without_odometry_each_measured_pose_is_that_of_the_camera(make: Callable[..., Robot]):
     robot = make(odom_frame="none")
+    robot.start_ns = 5_000_000_000  # of a recording
     robot.see(0)
     robot.see(1, state="predicted", result=NotLocalized("too_few_matches"))
     (t_ns, child, pose) = robot.published.transforms[0]
@@ -331,6 +334,9 @@ def test_without_odometry_each_measured_pose_is_that_of_the_camera(make: Callabl
     expected = MAP_FROM_ODOM @ BASE_FROM_CAM
     assert np.allclose(pose.matrix(), expected.matrix(), atol=1e-9)
     assert "/tf" not in robot.node.heard
+    for number in range(2, 9):
+        robot.see(number)
+    assert robot.warnings == []
 
 
 def test_images_faster_than_answers_are_one_warning(make: Callable[..., Robot]):

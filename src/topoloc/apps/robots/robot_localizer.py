@@ -90,8 +90,6 @@ class RobotLocalizer:
             self._reset(frame.t_ns)
             tracker.reset()
         self._last_ns, self._num_answers = frame.t_ns, self._num_answers + 1
-        self._clock.observe(frame.t_ns)
-        self._report("clock", self._clock.describe_fault())
         self._report("load", self._describe_load())
         self._odometry = odometry = self._find_odometry(frame.t_ns)
         if odometry is not None:
@@ -151,8 +149,7 @@ class RobotLocalizer:
     def _describe_load(self) -> str | None:
         """Return a sentence if images come twice as fast as answers, or faster."""
         dropped, answered = self._images.num_dropped if self._images else 0, self._num_answers
-        least = 100  # answers; the first ones take longer
-        if answered < least or dropped < answered:
+        if dropped < answered or answered < 100:  # the first answers take longer
             return None
         return (
             f"images come faster than answers ({dropped} of {dropped + answered} dropped); lower"
@@ -164,6 +161,8 @@ class RobotLocalizer:
         config, before = self._config, self._odometry
         if not config.has_odometry:
             return None
+        self._clock.observe(t_ns)
+        self._report("clock", self._clock.describe_fault())
         camera = (self._images and self._images.frame_id) or config.camera_frame
         try:
             odom_from_cam, base_from_cam = (
@@ -188,12 +187,15 @@ class RobotLocalizer:
             return None
         map_from_base = pose_of_transform(stamped_transform(message))
         least = 0.1  # metres and radians; RViz gives no height, roll and pitch
-        about = np.array(message.pose.covariance).reshape(6, 6) + least**2 * np.eye(6)
+        variances = np.clip(np.nan_to_num(message.pose.covariance[::7]), 0.0, 1e4)
+        about = np.diag(variances + least**2)
         covariance = Rigid3(np.eye(3), map_from_base.translation).transform_covariance(about)
-        map_from_cam = map_from_base @ odometry.base_from_cam
-        self._gate.expect(_make_evidence(t_ns, (map_from_cam, covariance), odometry))
-        world_from_map = self._map_from_world.inverse()
-        return world_from_map @ map_from_cam, world_from_map.transform_covariance(covariance)
+        pose, world_from_map = (
+            map_from_base @ odometry.base_from_cam,
+            self._map_from_world.inverse(),
+        )
+        self._gate.expect(_make_evidence(t_ns, (pose, covariance), odometry))
+        return world_from_map @ pose, world_from_map.transform_covariance(covariance)
 
     def _publish(self, answer: StreamedPose, odometry: Odometry | None) -> None:
         """Publish the pose of an image if it is evidence and the gate agrees."""
@@ -250,8 +252,7 @@ class RobotLocalizer:
         self._publisher.send_pose(evidence.t_ns, map_from_base, evidence.covariance)
 
     def _check_tilt(self, map_from_base: Rigid3) -> None:
-        limit = 0.35  # radians, steeper than any ramp
-        angle = tilt(map_from_base)
+        angle, limit = tilt(map_from_base), 0.35  # radians, steeper than any ramp
         text = (
             f"the robot is tilted by {math.degrees(angle):.0f} degrees in the map; --planar needs a"
             " map whose z axis points up"
@@ -268,8 +269,7 @@ class RobotLocalizer:
             if map_from_odom is not None and is_later:
                 self._last_stamp_ns = stamp_ns
                 self._sent_ns.append(stamp_ns)
-                child = self._config.odom_frame
-                self._publisher.send_transform(stamp_ns, child, map_from_odom)
+                self._publisher.send_transform(stamp_ns, self._config.odom_frame, map_from_odom)
 
     def _repeat(self) -> None:
         """Publish the transform and the diagnostics again and again; runs in the thread."""
