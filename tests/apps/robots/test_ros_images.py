@@ -85,6 +85,19 @@ def test_the_newest_is_taken_and_the_others_are_counted():
     assert images.frame_id == "camera_optical"
 
 
+def test_images_faster_than_answers_are_reported():
+    batches = [[_image(10 * n + k) for k in range(1, 4)] for n in range(100)]
+    images, _, _ = _open(*batches)
+    frames = images.frames(threading.Event())
+    for _ in islice(frames, 99):
+        assert images.describe_load() is None
+    next(frames)
+    assert images.describe_load() == (
+        "images come faster than answers (200 of 300 dropped); lower the rate of the camera or the"
+        " size of its images"
+    )
+
+
 def test_older_ones_are_dropped_unless_the_clock_was_set_back():
     images, _, _ = _open(
         [_image(5000)], [_image(4900)], [_image(5000)], [_image(1000)], [_image(1100)]

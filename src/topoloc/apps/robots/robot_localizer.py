@@ -65,9 +65,10 @@ class RobotLocalizer:
         self._clock = RobotClock(config.use_sim_time, config.clock_offset)
         self._transforms, self._gate = TransformBuffer(), HealthGate(config)
         self._map_to_odom, self._health = MapToOdom(config), Health()
-        self._odometry: Odometry | None = None
+        self._odometry: Odometry | None = None  # of the last image that had one
         self._user_pose: Any = None
-        self._last_ns = self._last_stamp_ns = self._num_answers = 0
+        self._last_ns = self._last_stamp_ns = 0
+        self._rival_at = -math.inf  # when another node published map to odom
         self._sent_ns = deque[int](maxlen=200)  # the stamps of its own transforms
         self._warned = set[str]()
         self._lock, self._is_closed = threading.RLock(), threading.Event()
@@ -89,9 +90,9 @@ class RobotLocalizer:
         if frame.t_ns < self._last_ns:
             self._reset(frame.t_ns)
             tracker.reset()
-        self._last_ns, self._num_answers = frame.t_ns, self._num_answers + 1
-        self._report("load", self._describe_load())
-        self._odometry = odometry = self._find_odometry(frame.t_ns)
+        self._last_ns = frame.t_ns
+        self._report("load", self._images and self._images.describe_load())
+        odometry = self._find_odometry(frame.t_ns)
         if odometry is not None:
             frame = replace(frame, odom_from_cam=odometry.odom_from_cam)
             if (prior := self._take_prior(frame.t_ns, odometry)) is not None:
@@ -118,8 +119,7 @@ class RobotLocalizer:
         with self._lock:
             sent = set(self._sent_ns)
         if any(one.child == odom_frame and one.t_ns not in sent for one in transforms):
-            text = f"another node publishes TF to {odom_frame}; stop it, or name the frames"
-            self._report("rival", text)
+            self._rival_at = time.monotonic()
         self._transforms.add(transforms, is_static=False)
 
     def _take_static(self, message: Any) -> None:
@@ -146,16 +146,6 @@ class RobotLocalizer:
             self._clock.reset()
             self._odometry, self._last_stamp_ns = None, 0
 
-    def _describe_load(self) -> str | None:
-        """Return a sentence if images come twice as fast as answers, or faster."""
-        dropped, answered = self._images.num_dropped if self._images else 0, self._num_answers
-        if dropped < answered or answered < 100:  # the first answers take longer
-            return None
-        return (
-            f"images come faster than answers ({dropped} of {dropped + answered} dropped); lower"
-            " the rate of the camera or the size of its images"
-        )
-
     def _find_odometry(self, t_ns: int) -> Odometry | None:
         """Return the odometry at the time of an image, None if there is none."""
         config, before = self._config, self._odometry
@@ -163,6 +153,10 @@ class RobotLocalizer:
             return None
         self._clock.observe(t_ns)
         self._report("clock", self._clock.describe_fault())
+        text = f"another node publishes TF to {config.odom_frame}; stop it, or name the frames"
+        seconds = 2.0  # it is reported for so long
+        is_rival = time.monotonic() - self._rival_at < seconds
+        self._report("rival", text if is_rival else None)
         camera = (self._images and self._images.frame_id) or config.camera_frame
         try:
             odom_from_cam, base_from_cam = (
@@ -178,7 +172,8 @@ class RobotLocalizer:
             motion = before.odom_from_cam.inverse() @ odom_from_cam
             step = np.array([np.linalg.norm(motion.translation), motion.angle()])
             travelled = before.travelled + step
-        return Odometry(odom_from_cam, base_from_cam, travelled)
+        self._odometry = Odometry(odom_from_cam, base_from_cam, travelled)
+        return self._odometry
 
     def _take_prior(self, t_ns: int, odometry: Odometry) -> Uncertain | None:
         """Return world_from_cam that a user gave since the last image, if any."""

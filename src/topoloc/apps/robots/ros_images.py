@@ -25,7 +25,8 @@ def is_topic(source: str) -> bool:
 
 
 class RosImages:
-    """The images of a topic. `num_dropped` counts those that a newer one replaced.
+    """The images of a topic. `num_taken` counts them, and `num_dropped` those that a newer one
+    replaced.
 
     Args:
         source: `ros:` and the topic. One that ends with /compressed has JPEG or PNG images.
@@ -55,14 +56,14 @@ class RosImages:
         self._warn, self._domain = warn, node.domain
         self._cameras: dict[tuple[int, int], Camera] = {}
         self._last_info: Any = None
-        self.frame_id, self.num_dropped = "", 0
+        self.frame_id, self.num_taken, self.num_dropped = "", 0, 0
 
     def frames(self, stop: threading.Event) -> Iterator[QueryFrame]:
         """Yield the newest image each time, until `stop`. An image that is older than the last one
         is dropped, unless the clock was set back. Raises CalibrationError: K is zero, or there is
         no calibration."""
         patience, set_back_ns = 10.0, 1_000_000_000  # seconds without an image; nanoseconds
-        since, number, last_ns = time.monotonic(), 0, 0
+        since, last_ns = time.monotonic(), 0
         while not stop.is_set():
             arrived = self._images.take(5)
             newer = [one for one in arrived if stamp_ns(one.header.stamp) > last_ns]
@@ -78,8 +79,18 @@ class RosImages:
             message = newer[-1]
             since, last_ns = time.monotonic(), stamp_ns(message.header.stamp)
             self.frame_id = frame_id(message)
-            yield self._make_frame(f"{number:06d}", last_ns, message, stop)
-            number += 1
+            self.num_taken += 1
+            yield self._make_frame(f"{self.num_taken - 1:06d}", last_ns, message, stop)
+
+    def describe_load(self) -> str | None:
+        """Return a sentence if images come twice as fast as they are taken, or faster."""
+        taken, dropped = self.num_taken, self.num_dropped
+        if dropped < taken or taken < 100:  # the first ones take longer
+            return None
+        return (
+            f"images come faster than answers ({dropped} of {dropped + taken} dropped); lower the"
+            " rate of the camera or the size of its images"
+        )
 
     def _describe_silence(self) -> str:
         return (
