@@ -31,7 +31,7 @@ from topoloc.recordings.frame import to_grey
 from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
-from topoloc.tracking.motion import MotionState, update_motion
+from topoloc.tracking.motion import Hypothesis, MotionState, update_motion
 from topoloc.tracking.point_tracker import PointTracker
 from topoloc.tracking.pose_hypotheses import PoseHypotheses
 from topoloc.tracking.stream_localizer import (
@@ -55,11 +55,14 @@ from topoloc.tracking.tracker_state import (
 
 
 class MapStream:
-    """Hold the state of one stream in one map, to which `localizer` is restricted."""
+    """Hold the state of one stream in one map, to which `localizer` is restricted. `prior` is a
+    hypothesis that no image has confirmed."""
 
-    def __init__(self, localizer: Localizer, config: TrackerConfig) -> None:
-        self.localizer, self.config = localizer, config
-        self._hypotheses, self._window = PoseHypotheses(config.hypotheses.motion), PoseWindow()
+    def __init__(
+        self, localizer: Localizer, config: TrackerConfig, prior: Hypothesis | None = None
+    ) -> None:
+        self.localizer, self.config, self._window = localizer, config, PoseWindow()
+        self._hypotheses = PoseHypotheses(config.hypotheses.motion, prior)
         self._stream_localizer = StreamLocalizer(localizer, self._hypotheses)
         self._last_smoothed: Rigid3 | None = None
         self._reference: ReferenceImage | None = None

@@ -64,10 +64,10 @@ class PoseHypotheses:
     prediction_scale: ClassVar[float] = 2.5
     """Factor on the sigma of the prediction, because hands jerk and wheels hit kerbs."""
 
-    def __init__(self, motion: MotionConfig) -> None:
-        self.motion = motion
-        self._ranked: list[Hypothesis] = []
-        self._null_weight, self.is_track_continued = 1.0, False
+    def __init__(self, motion: MotionConfig, prior: Hypothesis | None = None) -> None:
+        self.motion, self.is_track_continued = motion, False
+        self._ranked = list[Hypothesis]() if prior is None else [prior]
+        self._null_weight = 1.0 if prior is None else 1.0 - prior.weight
 
     @property
     def best(self) -> MotionState | None:

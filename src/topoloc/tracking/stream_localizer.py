@@ -57,6 +57,7 @@ class StreamLocalizer:
     def __init__(self, localizer: Localizer, hypotheses: PoseHypotheses) -> None:
         self._localizer, self._hypotheses = localizer, hypotheses
         self._last_ambiguous_pose: Rigid3 | None = None  # pose of the last ambiguous image
+        self._has_prior = hypotheses.best is not None
 
     def localize(
         self, frame: StreamFrame, expected: ExpectedPose | None
@@ -65,6 +66,9 @@ class StreamLocalizer:
 
         Return the pose of the best hypothesis, or the reason if there is none.
         """
+        best = self._hypotheses.best
+        if expected is None and self._has_prior and best is not None:
+            expected = ExpectedPose(best.world_from_cam, np.zeros((6, 6)), is_unique=True)
         pose_covariance = np.zeros((6, 6)) if expected is None else expected.pose_covariance
         refusal, found = None, list[LocalizedPose]()
         if expected is not None and expected.is_unique:
@@ -81,6 +85,7 @@ class StreamLocalizer:
             frame.t_ns, candidates, frame.odom_from_cam, self._compute_new_evidence(found)
         )
         if self._hypotheses.candidate_idx is not None:
+            self._has_prior = False
             return found[self._hypotheses.candidate_idx]
         return refusal or reject_jump(found[0].result)
 

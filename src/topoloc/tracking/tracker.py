@@ -11,11 +11,12 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import CameraLike, Deadline, camera_of, check_image_size
@@ -24,6 +25,7 @@ from topoloc.recordings.frame_checks import find_time_problem
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.map_stream import MapStream
+from topoloc.tracking.motion import Hypothesis, start_motion
 from topoloc.tracking.shared_cameras import SharedCameras
 from topoloc.tracking.stream_result import StreamedPose
 
@@ -112,6 +114,30 @@ class Tracker:
         limit = Deadline.of(self.localizer.config.max_ms if max_ms is None else max_ms)
         self._answer = self._process_in_tile(image, camera, t_ns, odom_from_cam, limit)
         return self._answer
+
+    def expect(
+        self,
+        world_from_cam: Rigid3,
+        covariance: Float[np.ndarray, "6 6"],
+        t_ns: int,
+        odom_from_cam: Rigid3 | None = None,
+    ) -> None:
+        """Take a prior: a pose at a time, that of the next image or earlier. It replaces the
+        stream so far. The next images are searched for around it first, and it is no result itself.
+
+        Args:
+            covariance: that of the left perturbation of `world_from_cam`.
+            odom_from_cam: pose from external odometry at this time.
+        """
+        probability = 0.5  # of a given pose
+        if self._stream is None:
+            return
+        local = inverse_covariance(world_from_cam, covariance)
+        state = start_motion(t_ns, world_from_cam, local)
+        node_id = self._stream.localizer.topomap.summaries[0].node_id  # means nothing
+        pose = Rigid3.identity()
+        prior = Hypothesis(state, odom_from_cam, state, probability, node_id, pose, None)
+        self._stream = MapStream(self._stream.localizer, self.config, prior)
 
     def process_missing(
         self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None

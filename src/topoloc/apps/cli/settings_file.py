@@ -37,6 +37,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ("localize", "evaluate", "explain", "serve", "follow", "update"),
     ),
     "track": ("topoloc.tracking.config", "TrackerConfig", ("localize", "serve", "follow")),
+    "robot": ("topoloc.apps.robots.config", "RobotConfig", ("follow",)),
     "serve": ("topoloc.apps.service.config", "ServiceConfig", ("serve",)),
     "cluster": (
         "topoloc.apps.cluster.config",

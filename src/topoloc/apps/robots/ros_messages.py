@@ -1,21 +1,26 @@
 """Messages of ROS 2 for DDS, with the fields of their IDL (geometry_msgs, tf2_msgs, std_msgs,
-builtin_interfaces).
+sensor_msgs, diagnostic_msgs, rosgraph_msgs, builtin_interfaces).
 
 Type names and topics are those of rmw: `geometry_msgs::msg::dds_::Pose_`, and `rt/` before the name
 of a topic. Needs `cyclonedds`, the extra `ros`.
 """
 
 # No `from __future__ import annotations`: cyclonedds reads the types of the fields as they are.
+import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float64, int32, sequence, uint32
+from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
 
 if TYPE_CHECKING:
     Covariance = list[float]
+    Matrix3x3 = list[float]
+    Matrix3x4 = list[float]
+    Bytes = bytes
 else:
-    Covariance = array[float64, 36]
+    Covariance, Matrix3x3, Matrix3x4 = (array[float64, size] for size in (36, 9, 12))
+    Bytes = sequence[uint8]
 
 
 @dataclass
@@ -88,3 +93,93 @@ class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformS
 @dataclass
 class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
     transforms: sequence[TransformStamped]
+
+
+@dataclass
+class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
+    clock: Time
+
+
+@dataclass
+class ImageHead(IdlStruct, typename="topoloc::ImageHead_"):
+    """The fields of an image before its data."""
+
+    header: Header
+    height: uint32
+    width: uint32
+    encoding: str
+    is_bigendian: uint8
+    step: uint32
+
+
+@dataclass
+class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
+    header: Header
+    height: uint32
+    width: uint32
+    encoding: str
+    is_bigendian: uint8
+    step: uint32
+    data: Bytes
+
+    @classmethod
+    def deserialize(cls, data: bytes, has_header: bool = True, use_version_2: Any = None) -> Self:
+        # cyclonedds makes a list of the bytes, which takes longer than tracking an image.
+        head = ImageHead.deserialize(data, has_header, use_version_2)
+        start = len(head.serialize())  # it ends with a number of 4 bytes, as the length is
+        (size,) = struct.unpack_from("<I" if data[1] & 1 else ">I", data, start)
+        shape = head.header, head.height, head.width
+        layout = head.encoding, head.is_bigendian, head.step
+        return cls(*shape, *layout, bytes(data[start + 4 : start + 4 + size]))
+
+
+@dataclass
+class CompressedImage(IdlStruct, typename="sensor_msgs::msg::dds_::CompressedImage_"):
+    header: Header
+    format: str
+    data: Bytes
+
+
+@dataclass
+class RegionOfInterest(IdlStruct, typename="sensor_msgs::msg::dds_::RegionOfInterest_"):
+    x_offset: uint32
+    y_offset: uint32
+    height: uint32
+    width: uint32
+    do_rectify: bool
+
+
+@dataclass
+class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
+    header: Header
+    height: uint32
+    width: uint32
+    distortion_model: str
+    d: sequence[float64]
+    k: Matrix3x3
+    r: Matrix3x3
+    p: Matrix3x4
+    binning_x: uint32
+    binning_y: uint32
+    roi: RegionOfInterest
+
+
+@dataclass
+class KeyValue(IdlStruct, typename="diagnostic_msgs::msg::dds_::KeyValue_"):
+    key: str
+    value: str
+
+
+@dataclass
+class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs::msg::dds_::DiagnosticStatus_"):
+    level: uint8
+    name: str
+    message: str
+    hardware_id: str
+    values: sequence[KeyValue]
+
+
+@dataclass
+class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::DiagnosticArray_"):
+    header: Header
+    status: sequence[DiagnosticStatus]

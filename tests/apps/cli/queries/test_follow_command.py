@@ -12,12 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 from mjpeg_camera import mjpeg_camera
 from topoloc.apps.cli import main
-from topoloc.geometry.rigid import Rigid3
 
 ROOT = Path(__file__).parents[4]
 
@@ -86,34 +84,15 @@ def test_it_ends_when_it_is_told_to(room_map: Path, tiny_recording: Path, tmp_pa
     assert len(lines) < 1000
 
 
-def test_robots_hear_what_was_measured(
-    room_map: Path,
-    tiny_recording: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-):
-    published = list[tuple[int, list[float]]]()
-
-    class Robots:
-        def __init__(self, domain: int) -> None:
-            assert domain == 7
-
-        def publish(self, t_ns: int, world_from_cam: Rigid3, covariance: np.ndarray) -> None:
-            assert covariance.shape == (6, 6)
-            published.append((t_ns, world_from_cam.translation.tolist()))
-
-    monkeypatch.setattr("topoloc.apps.cli.queries.follow.RosPublisher", Robots)
-    answers = [
-        json.loads(line) for line in _lines(capsys, room_map, f"{tiny_recording}@0:3", "--ros", 7)
-    ]
-    measured = [
-        (answer["t_ns"], answer["world_from_cam"]["translation"])
-        for answer in answers
-        if answer["localized"]
-    ]
-    assert published == measured
-    assert len(measured) == 3
-
-
 def test_what_cannot_be_followed_is_one_line(complaint: Callable[..., str], room_map: Path):
     assert "no such camera or stream" in complaint("follow", room_map, "/dev/video77")
+    assert "ros:/a b: no topic of ROS" in complaint("follow", room_map, "ros:/a b")
+
+
+def test_options_of_robots_need_ros(complaint: Callable[..., str], room_map: Path):
+    assert "--planar needs --ros" in complaint("follow", room_map, "0", "--planar", status=2)
+    both = ("--ros", "--planar", "--odom", "none")
+    assert "--planar is of a robot with odometry" in complaint(
+        "follow", room_map, "0", *both, status=2
+    )
+    assert "--odom needs --ros" in complaint("follow", room_map, "0", "--odom", "none", status=2)

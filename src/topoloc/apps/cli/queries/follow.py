@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import tyro
 
 from topoloc import (
     AtlasConfig,
-    Localization,
     LocalizerConfig,
     StereoSequence,
     Tracker,
@@ -29,11 +28,15 @@ from topoloc.apps.cli.output import (
     open_recording,
     option,
     print_line,
+    print_warning,
 )
 from topoloc.apps.cli.queries.query_answers import QueryFrame, capture_frames, format_answer
 from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.formats.live import LiveSource, is_live
-from topoloc.apps.robots.ros_publisher import RosPublisher
+from topoloc.apps.robots.config import RobotConfig
+from topoloc.apps.robots.robot_localizer import RobotLocalizer
+from topoloc.apps.robots.ros_images import RosImages, is_topic
+from topoloc.apps.robots.ros_node import RosNode
 from topoloc.plugin import as_monocular
 
 
@@ -44,7 +47,8 @@ class Command:
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """A map file, or an atlas."""
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
-    """A webcam's number or device, an address (rtsp://, http://), a video, or a recording."""
+    """A webcam's number or device, an address (rtsp://, http://), a topic of ROS 2
+    (ros:/camera/image_raw), a video, or a recording."""
     camera: Annotated[
         str | None, option("FILE|fx,fy,cx,cy|map|unknown", "that of the recording")
     ] = None
@@ -57,9 +61,14 @@ class Command:
     """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     plain: Flag = False
     """Print readable lines instead of JSON."""
-    ros: Annotated[int | None, option("DOMAIN")] = None
-    """Also publish the poses in this ROS 2 domain: /topoloc/pose, and TF from map to
-    topoloc_camera."""
+    ros: Flag = False
+    """Localize a robot of ROS 2: publish TF from map to odom, /topoloc/pose and /diagnostics in the
+    domain ROS_DOMAIN_ID."""
+    odom: Annotated[str | None, option("FRAME|none", "odom")] = None
+    """With --ros: the frame of the odometry in TF. `none`: there is no odometry, and TF is from map
+    to topoloc_camera."""
+    planar: Flag = False
+    """With --ros: publish x, y and yaw only."""
     config: File = None
     """TOML file with all other settings, as printed by `topoloc config follow`."""
 
@@ -68,28 +77,48 @@ class Command:
         localizer = open_localizer(
             self.map, settings.of(LocalizerConfig), self.features, settings.of(AtlasConfig)
         )
-        if self.ros is not None and len(localizer.tile_ids) > 1:
+        if self.ros and len(localizer.tile_ids) > 1:
             raise UsageError("--ros publishes poses of one world, and tiles have their own")
         with ExitStack() as stack:
             tracker = stack.enter_context(closing(Tracker(localizer, settings.of(TrackerConfig))))
             stop = stack.enter_context(catch_stop_signals())
             of_size = None if self.camera is None else parse_camera(localizer, self.camera)
-            robots = None if self.ros is None else RosPublisher(self.ros)
-            if is_live(self.source):
+            config, node, images = self._robot_config(settings.of(RobotConfig)), None, None
+            if self.ros or is_topic(self.source):
+                node = stack.enter_context(closing(RosNode(config)))
+            if node is not None and is_topic(self.source):
+                images = RosImages(node, self.source, of_size is not None, print_warning)
+                frames = images.frames(stop)
+            elif is_live(self.source):
                 frames = capture_frames(stack.enter_context(LiveSource(self.source)), stop)
             else:
                 recording = open_recording(self.source, self.format, None, self.topics)
                 frames = _read_frames(as_monocular(recording))
+            robot = None
+            if node is not None and self.ros:
+                robot = RobotLocalizer(node, config, images, print_warning)
+                stack.enter_context(closing(robot))
             for frame in frames:
                 if stop.is_set():
                     break
-                answer = frame.localize(tracker.cameras, tracker, of_size)
-                result = answer.result
-                if robots is not None and isinstance(result, Localization):
-                    robots.publish(frame.t_ns, result.world_from_cam, result.covariance)
-                line = format_answer(answer) if self.plain else json.dumps(answer.to_json())
-                print_line(line)
+                if robot is None:
+                    answer = frame.localize(tracker.cameras, tracker, of_size)
+                else:
+                    answer = robot.localize(frame, tracker, of_size)
+                print_line(format_answer(answer) if self.plain else json.dumps(answer.to_json()))
         return 0
+
+    def _robot_config(self, config: RobotConfig) -> RobotConfig:
+        given = [
+            name for name, value in (("--odom", self.odom), ("--planar", self.planar)) if value
+        ]
+        if given and not self.ros:
+            raise UsageError(f"{given[0]} needs --ros")
+        frame, is_planar = self.odom or config.odom_frame, self.planar or config.planar
+        config = replace(config, odom_frame=frame, planar=is_planar)
+        if config.planar and not config.has_odometry:
+            raise UsageError("--planar is of a robot with odometry; leave out --odom none")
+        return config
 
 
 def _read_frames(sequence: StereoSequence) -> Iterator[QueryFrame]:

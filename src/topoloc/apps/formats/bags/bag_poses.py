@@ -27,7 +27,8 @@ def trajectory_from_transforms(transforms: list[StampedTransform]) -> Trajectory
     return Trajectory.from_quaternions(numbers, list(by_time))
 
 
-def _pose_of_transform(its: StampedTransform) -> Rigid3:
+def pose_of_transform(its: StampedTransform) -> Rigid3:
+    """Return parent_from_child."""
     x, y, z, w = its.quat_xyzw
     return Rigid3.from_quat_wxyz(np.array([w, x, y, z]), np.array(its.translation))
 
@@ -82,7 +83,7 @@ class TransformTree:
         """Return last_from_first."""
         pose = Rigid3.identity()
         for child, _ in pairwise(path):
-            pose = _pose_of_transform(self.transforms[child][-1]) @ pose
+            pose = pose_of_transform(self.transforms[child][-1]) @ pose
         return pose
 
     def _static_edges(self, frame: str) -> Iterator[tuple[str, str]]:
@@ -108,7 +109,7 @@ class TransformTree:
     def _poses_at(self, child: str, t_ns: Sequence[int]) -> Sequence[Rigid3 | None]:
         """Return parent_from_child at each time."""
         if self._is_static(child):
-            return [_pose_of_transform(self.transforms[child][-1])] * len(t_ns)
+            return [pose_of_transform(self.transforms[child][-1])] * len(t_ns)
         return trajectory_from_transforms(self.transforms[child]).interpolate(t_ns)
 
 

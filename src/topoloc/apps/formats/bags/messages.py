@@ -141,12 +141,13 @@ def decode_transforms(topic: Topic, data: bytes) -> list[StampedTransform]:
     no whole message of this type, or numbers that are no pose."""
     message = decode(topic, data)
     try:
-        return [_stamped_transform(part) for part in getattr(message, "transforms", [message])]
+        return [stamped_transform(part) for part in getattr(message, "transforms", [message])]
     except (AttributeError, TypeError, ValueError, OverflowError):
         raise RecordingError(f"{topic.name}: not poses, or not as {topic.type} has them") from None
 
 
-def _stamped_transform(part: Any) -> StampedTransform:
+def stamped_transform(part: Any) -> StampedTransform:
+    """Return the transform of a part of a message. Raises ValueError: its numbers are no pose."""
     stamp = stamp_ns(part.header.stamp if hasattr(part, "header") else part.timestamp)
     has_parent = hasattr(part, "parent_frame_id")
     parent = _frame_name(part.parent_frame_id) if has_parent else frame_id(part)

@@ -1,0 +1,1 @@
+"""Localize a robot by its camera in a map of topoloc."""

@@ -1,0 +1,176 @@
+"""Decide which measured poses move the transform from map to odom, and how it follows them.
+
+Only images that were matched with the map are evidence, never poses predicted by odometry. A pose
+that agrees with the present transform updates it. Poses that contradict it must agree among each
+other, by the motion that odometry measured between them, before they replace it (a jump). The
+published transform moves smoothly, or at once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc import Rigid3
+from topoloc.apps.robots.config import RobotConfig
+
+Verdict = Literal["found", "jumped", "doubted"]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Hold the pose of an image.
+
+    Attributes:
+        t_ns: time of the image.
+        map_from_cam: measured pose.
+        covariance: that of its left perturbation.
+        odom_from_cam: pose by odometry.
+        travelled: way and rotation by odometry since the start, metres and radians.
+        is_localized: matched with the whole map. Otherwise points were tracked, whose errors are
+            those of the last such image.
+    """
+
+    t_ns: int
+    map_from_cam: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    odom_from_cam: Rigid3
+    travelled: Float[np.ndarray, "2"]
+    is_localized: bool
+
+    @property
+    def map_from_odom(self) -> Rigid3:
+        """Return the transform that this pose measures."""
+        return self.map_from_cam @ self.odom_from_cam.inverse()
+
+    @property
+    def local_covariance(self) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of the right perturbation, in axes of the camera."""
+        return self.map_from_cam.inverse().transform_covariance(self.covariance)
+
+
+class HealthGate:
+    """Hold the agreed transform from map to odom. `agreed` is its last evidence."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        self._config = config
+        self.agreed: Evidence | None = None
+        self._against: list[Evidence] = []
+        self._prior: Evidence | None = None
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Return whether the last images contradict the agreed transform."""
+        return bool(self._against)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.agreed = self._prior = None
+        self._against = []
+
+    def expect(self, prior: Evidence) -> None:
+        """Take a pose that a user gave. The next one that agrees with it is confirmed by that."""
+        self._prior = prior
+
+    def judge(self, evidence: Evidence) -> Verdict:
+        """Take the pose of an image.
+
+        Return "found" if it agrees with the transform, "jumped" if it is the last of several that
+        confirm another one, else "doubted". "doubted" poses are not to be published.
+        """
+        if self.agreed is not None and self._agree(self.agreed, evidence):
+            self.agreed, self._against = evidence, []
+            return "found"
+        if not evidence.is_localized:
+            return "doubted"
+        if self._against and not self._agree(self._against[-1], evidence):
+            self._against = []
+        self._against.append(evidence)
+        is_expected = self._prior is not None and self._agree(self._prior, evidence)
+        if not (is_expected or self._is_confirmed()):
+            return "doubted"
+        self.agreed, self._against, self._prior = evidence, [], None
+        return "jumped"
+
+    def _is_confirmed(self) -> bool:
+        first, last = self._against[0], self._against[-1]
+        if len(self._against) < self._config.confirm_images or self.agreed is None:
+            return len(self._against) >= self._config.confirm_images
+        # Images of a robot that stands (metres and radians) have the same errors.
+        still, times_as_long = 0.1, 5.0
+        is_still = bool(np.all(last.travelled - first.travelled < still))
+        seconds = self._config.confirm_seconds * (times_as_long if is_still else 1.0)
+        return last.t_ns - first.t_ns >= seconds * 1e9
+
+    def _agree(self, before: Evidence, after: Evidence) -> bool:
+        """Return whether two poses are the same but for the motion by odometry between them."""
+        metres, radians = 0.05, 0.05  # smaller differences are none
+        max_surprise = 33.0  # chi^2 of 6 degrees of freedom: 1 in 100,000
+        motion = before.odom_from_cam.inverse() @ after.odom_from_cam
+        way_and_turn = np.abs(after.travelled - before.travelled)
+        sigmas = self._config.odometry_error * np.repeat(way_and_turn, 3) + 1e-3
+        to_after = motion.inverse()
+        return (before.map_from_cam @ motion).is_same(
+            after.map_from_cam,
+            metres,
+            radians,
+            covariance=to_after.transform_covariance(before.local_covariance)
+            + after.local_covariance
+            + np.diag(sigmas**2),
+            max_square=max_surprise,
+        )
+
+
+class MapToOdom:
+    """Hold the published transform, and the one that it moves to."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        self._config = config
+        self._target: Rigid3 | None = None
+        self._published = Rigid3.identity()
+        self._odom_from_base, self._last = Rigid3.identity(), 0.0
+
+    def reset(self) -> None:
+        """Forget the transform."""
+        self._target = None
+
+    def set_target(self, map_from_base: Rigid3, odom_from_base: Rigid3, at_once: bool) -> None:
+        """Take the agreed pose of the robot, measured and by odometry at the same time."""
+        is_first, self._odom_from_base = self._target is None, odom_from_base
+        self._target = map_from_base @ odom_from_base.inverse()
+        if is_first or at_once:
+            self._published = self._target
+
+    def advance(self, seconds: float) -> Rigid3 | None:
+        """Return map_from_odom at `seconds`, of any clock that goes on. None: not known yet."""
+        elapsed, self._last = max(seconds - self._last, 0.0), seconds
+        if self._target is None:
+            return None
+        # Corrections turn about the robot, since those about the origin of odom swing it.
+        now, then = (one @ self._odom_from_base for one in (self._published, self._target))
+        way = float(np.linalg.norm(then.translation - now.translation))
+        turn = (now.inverse() @ then).angle()
+        need = max(way / self._config.correction_speed, turn / self._config.correction_turn)
+        if need <= elapsed:
+            self._published = self._target
+        else:
+            moved = now.interpolate(then, elapsed / need)
+            self._published = moved @ self._odom_from_base.inverse()
+        return self._published
+
+
+def project_to_plane(pose: Rigid3) -> Rigid3:
+    """Return x, y and yaw of a pose in a frame whose z points up."""
+    x, y = pose.translation[:2]
+    yaw = math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
+    turn = np.array([0.0, 0.0, 0.0, 0.0, 0.0, yaw])
+    return Rigid3(Rigid3.exp(turn).rotation, np.array([x, y, 0.0]))
+
+
+def tilt(pose: Rigid3) -> float:
+    """Return the angle between the z axes of both frames, radians."""
+    return math.acos(max(-1.0, min(1.0, float(pose.rotation[2, 2]))))

@@ -1,0 +1,295 @@
+"""Localize a robot by its camera and its odometry: TF from map to odom (REP 105), the pose of the
+robot, and diagnostics. Camera frames are optical (x right, y down, z forward)."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from topoloc import Localization, Rigid3, StreamedPose, Tracker
+from topoloc.apps.cli.queries.query_answers import QueryAnswer, QueryFrame
+from topoloc.apps.formats.bags.bag_poses import pose_of_transform
+from topoloc.apps.formats.bags.messages import frame_id, stamp_ns, stamped_transform
+from topoloc.apps.query_camera import CameraOfSize
+from topoloc.apps.robots.config import RobotConfig
+from topoloc.apps.robots.map_to_odom import (
+    Evidence,
+    HealthGate,
+    MapToOdom,
+    project_to_plane,
+    tilt,
+)
+from topoloc.apps.robots.robot_health import Health, RobotClock
+from topoloc.apps.robots.ros_images import RosImages
+from topoloc.apps.robots.ros_node import INITIAL_POSE_TOPIC, RobotPublisher, RosNode, Uncertain
+from topoloc.apps.robots.transform_buffer import TransformBuffer, TransformError
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """Hold the pose of the camera in odom and on the robot at the time of an image, and the way and
+    the rotation so far."""
+
+    odom_from_cam: Rigid3
+    base_from_cam: Rigid3
+    travelled: np.ndarray
+
+
+class RobotLocalizer:
+    """Localize the images of a robot and publish what they say, until it is closed.
+
+    Args:
+        node: its participant, not yet started.
+        images: the topic of the images, if they have one.
+        warn: gets one line for each new fault.
+        map_from_world: the robot's map in which the poses are; z points up in it.
+    """
+
+    def __init__(
+        self,
+        node: RosNode,
+        config: RobotConfig,
+        images: RosImages | None,
+        warn: Callable[[str], None],
+        map_from_world: Rigid3 | None = None,
+    ) -> None:
+        self._config, self._images, self._warn = config, images, warn
+        self._map_from_world = map_from_world or Rigid3.identity()
+        self._clock = RobotClock(config.use_sim_time, config.clock_offset)
+        self._transforms, self._gate = TransformBuffer(), HealthGate(config)
+        self._map_to_odom, self._health = MapToOdom(config), Health()
+        self._odometry: Odometry | None = None  # of the last image that had one
+        self._user_pose: Any = None
+        self._last_ns = self._last_stamp_ns = 0
+        self._rival_at = -math.inf  # when another node published map to odom
+        self._sent_ns = deque[int](maxlen=200)  # the stamps of its own transforms
+        self._warned = set[str]()
+        self._lock, self._is_closed = threading.RLock(), threading.Event()
+        self._publisher = RobotPublisher(node, config)
+        self._create_readers(node)
+        node.start()
+        self._timer = threading.Thread(target=self._repeat, name="tf", daemon=True)
+        self._timer.start()
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._is_closed.set()
+        self._timer.join(1.0)
+
+    def localize(
+        self, frame: QueryFrame, tracker: Tracker, camera_of_size: CameraOfSize | None
+    ) -> QueryAnswer:
+        """Localize the next image and publish its pose. Raises as `QueryFrame.localize`."""
+        if frame.t_ns < self._last_ns:
+            self._reset(frame.t_ns)
+            tracker.reset()
+        self._last_ns = frame.t_ns
+        self._report("load", self._images and self._images.describe_load())
+        odometry = self._find_odometry(frame.t_ns)
+        if odometry is not None:
+            frame = replace(frame, odom_from_cam=odometry.odom_from_cam)
+            if (prior := self._take_prior(frame.t_ns, odometry)) is not None:
+                tracker.expect(*prior, frame.t_ns, odometry.odom_from_cam)
+        answer = frame.localize(tracker.cameras, tracker, camera_of_size)
+        if answer.streamed is not None:
+            self._publish(answer.streamed, odometry)
+        return answer
+
+    def _create_readers(self, node: RosNode) -> None:
+        ros, config = node.messages, self._config
+        if not config.publish_initial_pose:
+            kind = ros.PoseWithCovarianceStamped
+            node.create_reader(INITIAL_POSE_TOPIC, kind, "reliable", self._take_user_pose)
+        if config.has_odometry:
+            node.create_reader("/tf", ros.TFMessage, "reliable", self._take_transforms)
+            node.create_reader("/tf_static", ros.TFMessage, "latched", self._take_static)
+        if config.use_sim_time:
+            node.create_reader("/clock", ros.Clock, "sensor", self._take_time)
+
+    def _take_transforms(self, message: Any) -> None:
+        transforms = [stamped_transform(one) for one in message.transforms]
+        odom_frame = self._config.odom_frame
+        with self._lock:
+            sent = set(self._sent_ns)
+        if any(one.child == odom_frame and one.t_ns not in sent for one in transforms):
+            self._rival_at = time.monotonic()
+        self._transforms.add(transforms, is_static=False)
+
+    def _take_static(self, message: Any) -> None:
+        self._transforms.add(map(stamped_transform, message.transforms), is_static=True)
+
+    def _take_time(self, message: Any) -> None:
+        self._clock.set_simulated(stamp_ns(message.clock))
+
+    def _take_user_pose(self, message: Any) -> None:
+        name, expected = frame_id(message), self._config.map_frame
+        if name != expected:
+            self._warn(
+                f"a pose on /{INITIAL_POSE_TOPIC} is ignored: it is in {name}, not {expected}"
+            )
+            return
+        self._user_pose = message
+
+    def _reset(self, t_ns: int) -> None:
+        """Start again, because the clock was set back."""
+        with self._lock:
+            self._gate.reset()
+            self._map_to_odom.reset()
+            self._transforms.forget_after(t_ns)
+            self._clock.reset()
+            self._odometry, self._last_stamp_ns = None, 0
+
+    def _find_odometry(self, t_ns: int) -> Odometry | None:
+        """Return the odometry at the time of an image, None if there is none."""
+        config, before = self._config, self._odometry
+        if not config.has_odometry:
+            return None
+        self._clock.observe(t_ns)
+        self._report("clock", self._clock.describe_fault())
+        text = f"another node publishes TF to {config.odom_frame}; stop it, or name the frames"
+        seconds = 2.0  # it is reported for so long
+        is_rival = time.monotonic() - self._rival_at < seconds
+        self._report("rival", text if is_rival else None)
+        camera = (self._images and self._images.frame_id) or config.camera_frame
+        try:
+            odom_from_cam, base_from_cam = (
+                self._transforms.look_up(target, camera, t_ns, config.tf_wait)
+                for target in (config.odom_frame, config.base_frame)
+            )
+        except TransformError as error:
+            self._report("tf", str(error))
+            return None
+        self._report("tf", None)
+        travelled = np.zeros(2)
+        if before is not None:
+            motion = before.odom_from_cam.inverse() @ odom_from_cam
+            step = np.array([np.linalg.norm(motion.translation), motion.angle()])
+            travelled = before.travelled + step
+        self._odometry = Odometry(odom_from_cam, base_from_cam, travelled)
+        return self._odometry
+
+    def _take_prior(self, t_ns: int, odometry: Odometry) -> Uncertain | None:
+        """Return world_from_cam that a user gave since the last image, if any."""
+        message, self._user_pose = self._user_pose, None
+        if message is None:
+            return None
+        map_from_base = pose_of_transform(stamped_transform(message))
+        least = 0.1  # metres and radians; RViz gives no height, roll and pitch
+        variances = np.clip(np.nan_to_num(message.pose.covariance[::7]), 0.0, 1e4)
+        about = np.diag(variances + least**2)
+        covariance = Rigid3(np.eye(3), map_from_base.translation).transform_covariance(about)
+        pose, world_from_map = (
+            map_from_base @ odometry.base_from_cam,
+            self._map_from_world.inverse(),
+        )
+        self._gate.expect(_make_evidence(t_ns, (pose, covariance), odometry))
+        return world_from_map @ pose, world_from_map.transform_covariance(covariance)
+
+    def _publish(self, answer: StreamedPose, odometry: Odometry | None) -> None:
+        """Publish the pose of an image if it is evidence and the gate agrees."""
+        health = self._health
+        pose, health.probability = self._measured_pose(answer)
+        health.state = answer.state
+        health.num_dropped = 0 if self._images is None else self._images.num_dropped
+        if pose is not None and health.probability >= self._config.min_probability:
+            if not self._config.has_odometry:
+                self._publish_camera(answer.t_ns, *pose)
+            elif odometry is not None:
+                is_localized = answer.state == "localized"
+                self._judge(_make_evidence(answer.t_ns, pose, odometry, is_localized), odometry)
+        health.is_contradicted = self._gate.is_contradicted
+        health.latency_ms = (self._clock.now_ns() - answer.t_ns) / 1e6
+        health.answer_at = time.monotonic()
+
+    def _measured_pose(self, answer: StreamedPose) -> tuple[Uncertain | None, float]:
+        """Return map_from_cam and its probability. None of a pose that is only predicted, or of an
+        image that a camera repeats."""
+        result = answer.result
+        if not isinstance(result, Localization) or answer.is_repeated:
+            return None, 0.0
+        pose, covariance = result.world_from_cam, result.covariance
+        if answer.smoothed is not None and answer.smoothed_covariance is not None:
+            pose, covariance = answer.smoothed, answer.smoothed_covariance
+        moved = self._map_from_world.transform_covariance(covariance)
+        return (self._map_from_world @ pose, moved), result.probability
+
+    def _publish_camera(self, t_ns: int, map_from_cam: Rigid3, covariance: np.ndarray) -> None:
+        """Publish the pose of a camera without odometry."""
+        self._health.evidence_at = time.monotonic()
+        self._publisher.send_transform(t_ns, self._config.camera_frame, map_from_cam)
+        self._publisher.send_pose(t_ns, map_from_cam, covariance)
+
+    def _judge(self, evidence: Evidence, odometry: Odometry) -> None:
+        """Ask the gate about a pose, and publish it if it agrees."""
+        is_first, verdict = self._gate.agreed is None, self._gate.judge(evidence)
+        if verdict == "doubted":
+            return
+        self._health.evidence_at = time.monotonic()
+        self._health.num_jumps += verdict == "jumped" and not is_first
+        cam_from_base = odometry.base_from_cam.inverse()
+        map_from_base = evidence.map_from_cam @ cam_from_base
+        odom_from_base = odometry.odom_from_cam @ cam_from_base
+        if self._config.planar:
+            self._check_tilt(map_from_base)
+            map_from_base = project_to_plane(map_from_base)
+            odom_from_base = project_to_plane(odom_from_base)
+        is_at_once = verdict == "jumped" and self._config.jump == "at_once"
+        with self._lock:
+            self._map_to_odom.set_target(map_from_base, odom_from_base, is_at_once)
+        self._send_map_to_odom()
+        self._publisher.send_pose(evidence.t_ns, map_from_base, evidence.covariance)
+
+    def _check_tilt(self, map_from_base: Rigid3) -> None:
+        angle, limit = tilt(map_from_base), 0.35  # radians, steeper than any ramp
+        text = (
+            f"the robot is tilted by {math.degrees(angle):.0f} degrees in the map; --planar needs a"
+            " map whose z axis points up"
+        )
+        self._report("tilt", text if angle > limit else None)
+
+    def _send_map_to_odom(self) -> None:
+        """Publish the transform, stamped ahead. Its stamps increase, unless the clock is set."""
+        ahead_ns, set_ns = round(1e9 * self._config.transform_tolerance), 1_000_000_000
+        with self._lock:
+            map_from_odom = self._map_to_odom.advance(time.monotonic())
+            stamp_ns = self._clock.now_ns() + ahead_ns
+            is_later = not 0 <= self._last_stamp_ns - stamp_ns < set_ns
+            if map_from_odom is not None and is_later:
+                self._last_stamp_ns = stamp_ns
+                self._sent_ns.append(stamp_ns)
+                self._publisher.send_transform(stamp_ns, self._config.odom_frame, map_from_odom)
+
+    def _repeat(self) -> None:
+        """Publish the transform and the diagnostics again and again; runs in the thread."""
+        interval, due, before = 1.0, 0.0, None  # seconds between diagnostics of one level
+        while not self._is_closed.wait(1.0 / self._config.rate):
+            self._send_map_to_odom()
+            now = time.monotonic()
+            level, text = self._health.judge(now, self._config)
+            if now >= due or level != before:
+                due, before = now + interval, level
+                values = self._health.values(now, self._clock.offset)
+                self._publisher.send_status(self._clock.now_ns(), level, text, values)
+
+    def _report(self, kind: str, text: str | None) -> None:
+        """Take or remove a fault of a kind. The first of a kind is a warning as well."""
+        if text is None:
+            self._health.faults.pop(kind, None)
+            return
+        self._health.faults[kind] = text
+        if kind not in self._warned:
+            self._warned.add(kind)
+            self._warn(text)
+
+
+def _make_evidence(
+    t_ns: int, pose: Uncertain, odometry: Odometry, is_localized: bool = False
+) -> Evidence:
+    return Evidence(t_ns, *pose, odometry.odom_from_cam, odometry.travelled, is_localized)

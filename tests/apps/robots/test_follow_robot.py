@@ -1,0 +1,158 @@
+"""`topoloc follow --ros` as a user types it, beside a robot that drives in real time."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="the extra ros is not installed")
+from played_robot import BASE_FROM_CAM, PlayedRobot, Step, followed
+from tiny_world import CAMERA, path_pose, render, room
+from topoloc.demo.recordings import SHIPPED
+from topoloc.localization.map_facts.map_building import build_map
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import as_monocular
+
+DOMAIN = 100 + os.getpid() % 100  # tests run side by side
+START_S = 150.0  # kernels may have to be compiled
+
+
+@pytest.fixture
+def robot() -> Iterator[PlayedRobot]:
+    robot = PlayedRobot(CAMERA, DOMAIN)
+    yield robot
+    robot.close()
+
+
+def _picture(place: float) -> np.ndarray:
+    return render(room(), path_pose(place), noise_seed=round(1000 * place))[0]
+
+
+def _dark(place: float) -> np.ndarray:
+    return np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+
+
+def _drive(
+    start: float, end: float, picture: Callable[[float], np.ndarray] = _picture
+) -> list[Step]:
+    """Two centimetres an image."""
+    places = np.arange(start, end, 0.15 if end > start else -0.15)
+    return [Step(path_pose(place), picture(place)) for place in places.tolist()]
+
+
+def _start(robot: PlayedRobot, step: Step) -> None:
+    assert robot.wait_for_listener(START_S)
+    assert robot.stand(step, lambda: bool(robot.heard.poses), START_S)
+    robot.heard.poses.clear()
+    robot.heard.statuses.clear()
+
+
+def _levels(robot: PlayedRobot, steps: Sequence[int]) -> set[int]:
+    """Levels of /diagnostics between two steps."""
+    first, last = (robot.start_ns + round(step * 1e9 / robot.hz) for step in steps)
+    return {level for at, level, _, _ in robot.heard.statuses if first <= at <= last}
+
+
+def test_tf_is_right_through_wrong_images_darkness_and_a_kidnapping(
+    robot: PlayedRobot, room_map: Path
+):
+    """The bounds leave room for a busy machine. benchmarks/robot_simulation.py prints figures."""
+    steps = _drive(1.0, 4.0)
+    steps += _drive(4.0, 5.2, lambda place: _picture(place + 6.0))  # for 0.8 s another place
+    steps += _drive(5.2, 7.0)
+    dark = len(steps)
+    steps += _drive(7.0, 9.7, _dark)
+    light = len(steps)
+    steps += _drive(9.7, 12.0)
+    kidnapped = len(steps)
+    steps += [Step(path_pose(3.0), _picture(3.0), is_carried=True), *_drive(3.15, 12.0)]
+    with followed(room_map, DOMAIN, "--ros") as process:
+        _start(robot, steps[0])
+        robot.play(steps)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+    before, after = robot.errors(0, kidnapped - 1), robot.errors(kidnapped, len(steps) - 2)
+    assert np.median(before) < 0.02
+    assert before.max() < 0.3
+    assert after[:10].max() > 1.0  # nobody can know
+    assert after[-50:].max() < 0.05
+    poses = robot.pose_errors()
+    assert len(poses) > 30
+    assert poses.max() < 0.3  # the wrong ones are not published
+    assert np.median(poses) < 0.02
+    assert robot.gaps().max() < 1.0
+    assert np.median(robot.latencies()) < 1.0
+    assert _levels(robot, (5, 18)) == {0}
+    assert 1 in _levels(robot, (dark + 8, light + 5))  # WARN, seconds are those of a busy machine
+    assert robot.heard.statuses[-1][1] == 0
+
+
+def test_a_camera_without_calibration_is_one_line(robot: PlayedRobot, room_map: Path):
+    robot.is_calibrated = False
+    with followed(room_map, DOMAIN) as process:
+        assert robot.wait_for_listener(START_S)
+        robot.stand(_drive(1.0, 1.1)[0], lambda: process.poll() is not None, START_S)
+        assert process.wait(30) == 1
+        assert process.stderr is not None
+        (line,) = process.stderr.read().splitlines()
+    assert line == (
+        "error: /camera/camera_info: K is zero, the camera is not calibrated; calibrate it, or give"
+        " --camera FILE"
+    )
+
+
+def test_without_odometry_tf_is_that_of_the_camera(robot: PlayedRobot, room_map: Path):
+    with followed(room_map, DOMAIN, "--ros", "--odom", "none", "--camera", "map"):
+        steps = _drive(1.0, 2.0)
+        _start(robot, steps[0])
+        robot.play(steps)
+    assert robot.heard.transforms == []
+    child, stamp, pose = robot.heard.others[-1]
+    camera = robot.world_from_cam(stamp)
+    assert child == "topoloc_camera"
+    assert np.linalg.norm(pose.translation - camera.translation) < 0.05
+    assert np.allclose(robot.heard.poses[-1][2].matrix(), pose.matrix(), atol=1e-9)
+    assert np.linalg.norm(BASE_FROM_CAM.translation) > 0.4  # it is not the robot's
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["lab", "kitchen"])
+def test_tf_is_right_in_the_demos_lab_and_in_a_real_kitchen(
+    request: pytest.FixtureRequest, place: str, tmp_path: Path
+):
+    """The lab in its own time, two images a second and 0.26 m apart. The kitchen of 7-Scenes, whose
+    truth is that of a tracker; one frame in four is mapped, and others are played."""
+    if place == "lab":
+        mapped = [str(SHIPPED / "map_lap1"), str(SHIPPED / "map_lap2")]
+        played, hz = str(SHIPPED / "day"), 1.92
+    else:
+        kitchen = request.getfixturevalue("shared") / "data" / "seven_scenes" / "kitchen" / "seq-01"
+        if not kitchen.is_dir():
+            pytest.skip(f"no recording at {kitchen}")
+        mapped, played, hz = [f"{kitchen}@0::4"], f"{kitchen}@2::4", 10.0
+    build_map([open_sequence(path) for path in mapped]).save(tmp_path / "place.topo")
+    sequence, steps = as_monocular(open_sequence(played)), list[Step]()
+    for frame in (sequence[index] for index in range(min(len(sequence), 120))):
+        assert frame.world_from_cam is not None
+        steps.append(Step(frame.world_from_cam, frame.image))
+    camera = sequence[0].camera
+    assert camera is not None
+    robot = PlayedRobot(camera, DOMAIN, hz)
+    with followed(tmp_path / "place.topo", DOMAIN, "--ros") as process:
+        _start(robot, steps[0])
+        robot.play(steps)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+    errors, poses = robot.errors(0, len(steps) - 2), robot.pose_errors()
+    robot.close()
+    assert np.median(errors) < 0.02
+    assert errors.max() < 0.3
+    assert len(poses) > 0.5 * len(steps)
+    assert poses.max() < 0.3

@@ -1,0 +1,192 @@
+"""Images of a topic: which are taken, which are counted as dropped, and their cameras."""
+
+from __future__ import annotations
+
+import threading
+from itertools import islice
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from topoloc.apps.robots import ros_images
+from topoloc.apps.robots.ros_images import RosImages
+from topoloc.apps.robots.ros_node import RosNode, TopicReader
+from topoloc.errors import CalibrationError, RecordingError
+
+WIDTH, HEIGHT = 6, 4
+RGB = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+
+
+class Queue(TopicReader):
+    def __init__(self) -> None:
+        self.batches: list[list[Any]] = []
+
+    def take(self, num: int) -> list[Any]:
+        return self.batches.pop(0) if self.batches else []
+
+
+class Node(RosNode):
+    def __init__(self) -> None:
+        self.messages = SimpleNamespace(Image="Image", CompressedImage="JPEG", CameraInfo="Info")
+        self.queues: dict[str, Queue] = {}
+        self.kinds: dict[str, Any] = {}
+        self.domain = 0
+
+    def create_reader(self, name: str, kind: Any, quality: str, callback: Any = None) -> Any:
+        self.kinds[name], self.queues[name] = kind, Queue()
+        return self.queues[name]
+
+
+def _header(t_ms: int) -> SimpleNamespace:
+    stamp = SimpleNamespace(sec=t_ms // 1000, nanosec=t_ms % 1000 * 1_000_000)
+    return SimpleNamespace(stamp=stamp, frame_id="/camera_optical")
+
+
+def _image(t_ms: int, pixels: np.ndarray = RGB, encoding: str = "rgb8") -> SimpleNamespace:
+    """With three bytes of padding at the end of each row."""
+    rows = np.pad(pixels.reshape(HEIGHT, -1), ((0, 0), (0, 3)))
+    return SimpleNamespace(
+        header=_header(t_ms), height=HEIGHT, width=WIDTH, encoding=encoding, is_bigendian=0,
+        step=rows.shape[1], data=rows.tobytes(),
+    )  # fmt: skip
+
+
+def _info(focal: float = 300.0, model: str = "plumb_bob", **changes: Any) -> SimpleNamespace:
+    matrix = np.array([[focal, 0.0, 2.5], [0.0, focal, 1.5], [0.0, 0.0, 1.0]]) * (focal > 0.0)
+    projection = np.column_stack([matrix, np.zeros(3)])
+    roi = SimpleNamespace(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    plain = {
+        "header": _header(0), "height": HEIGHT, "width": WIDTH, "distortion_model": model,
+        "d": [0.1, 0.0, 0.0, 0.0], "k": matrix.ravel(), "r": np.eye(3).ravel(),
+        "p": projection.ravel(), "binning_x": 0, "binning_y": 0, "roi": roi,
+    }  # fmt: skip
+    return SimpleNamespace(**plain | changes)
+
+
+def _open(
+    *batches: list[Any], info: Any = None, topic: str = "/camera/image_raw"
+) -> tuple[RosImages, Node, list[str]]:
+    node, warnings = Node(), list[str]()
+    images = RosImages(node, f"ros:{topic}", info is None, warnings.append)
+    node.queues[topic].batches = list(batches)
+    if info is not None:
+        node.queues["/camera/camera_info"].batches = [[info]]
+    return images, node, warnings
+
+
+def test_the_newest_is_taken_and_the_others_are_counted():
+    images, _, _ = _open([_image(100)], [_image(t) for t in (200, 300, 400)], [], [_image(500)])
+    taken = [frame.t_ns // 1_000_000 for frame in islice(images.frames(threading.Event()), 3)]
+    assert taken == [100, 400, 500]
+    assert images.num_dropped == 2
+    assert images.frame_id == "camera_optical"
+
+
+def test_images_faster_than_answers_are_reported():
+    batches = [[_image(10 * n + k) for k in range(1, 4)] for n in range(100)]
+    images, _, _ = _open(*batches)
+    frames = images.frames(threading.Event())
+    for _ in islice(frames, 99):
+        assert images.describe_load() is None
+    next(frames)
+    assert images.describe_load() == (
+        "images come faster than answers (200 of 300 dropped); lower the rate of the camera or the"
+        " size of its images"
+    )
+
+
+def test_older_ones_are_dropped_unless_the_clock_was_set_back():
+    images, _, _ = _open(
+        [_image(5000)], [_image(4900)], [_image(5000)], [_image(1000)], [_image(1100)]
+    )
+    taken = [frame.t_ns // 1_000_000 for frame in islice(images.frames(threading.Event()), 3)]
+    assert taken == [5000, 1000, 1100]
+    assert images.num_dropped == 2
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixels", "expected"),
+    [
+        ("rgb8", RGB, RGB),
+        ("bgr8", RGB[..., ::-1], RGB),
+        ("rgba8", np.dstack([RGB, RGB[..., 0]]), RGB),
+        ("bgra8", np.dstack([RGB[..., ::-1], RGB[..., 0]]), RGB),
+        ("mono8", RGB[..., 0], RGB[..., 0]),
+    ],
+)
+def test_pixels_are_rgb_or_grey_without_padding(
+    encoding: str, pixels: np.ndarray, expected: np.ndarray
+):
+    images, _, _ = _open([_image(1, np.ascontiguousarray(pixels), encoding)])
+    (frame,) = islice(images.frames(threading.Event()), 1)
+    assert np.array_equal(frame.read().image, expected)
+    assert frame.read().camera is None  # it is given
+
+
+def test_compressed_images_have_the_calibration_beside_the_raw_ones():
+    topic = "/camera/image_raw/compressed"
+    data = cv2.imencode(".png", RGB[..., ::-1])[1].tobytes()
+    message = SimpleNamespace(header=_header(7), format="png", data=data)
+    images, node, _ = _open([message], info=_info(), topic=topic)
+    (frame,) = islice(images.frames(threading.Event()), 1)
+    assert node.kinds == {topic: "JPEG", "/camera/camera_info": "Info"}
+    assert np.array_equal(frame.read().image, RGB)
+    camera = frame.read().camera
+    assert camera is not None
+    assert (camera.model, camera.fx, camera.cx) == ("OPENCV", 300.0, 2.5)
+
+
+def test_models_and_rectified_images():
+    fisheye = _info(model="equidistant")
+    rational = _info(model="rational_polynomial", d=[0.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0])
+    found = []
+    for info, topic in (
+        (fisheye, "/camera/image_raw"),
+        (rational, "/camera/image_raw"),
+        (fisheye, "/camera/image_rect"),
+    ):
+        images, _, _ = _open([_image(1)], info=info, topic=topic)
+        (frame,) = islice(images.frames(threading.Event()), 1)
+        camera = frame.read().camera
+        assert camera is not None
+        found.append(camera.model)
+    assert found == ["OPENCV_FISHEYE", "FULL_OPENCV", "PINHOLE"]
+
+
+def test_binning_belongs_to_the_full_image():
+    half = _info(width=2 * WIDTH, height=2 * HEIGHT, binning_x=2, binning_y=2)
+    images, _, _ = _open([_image(1)], info=half)
+    (frame,) = islice(images.frames(threading.Event()), 1)
+    camera = frame.read().camera
+    assert camera is not None
+    assert (camera.width, camera.fx) == (WIDTH, 150.0)
+
+
+def test_an_uncalibrated_camera_is_refused():
+    images, _, _ = _open([_image(1)], info=_info(0.0))
+    (frame,) = islice(images.frames(threading.Event()), 1)
+    with pytest.raises(CalibrationError, match=r"K is zero, .* or give --camera FILE"):
+        frame.read()
+
+
+def test_missing_messages_are_named(monkeypatch: pytest.MonkeyPatch):
+    now = iter(np.arange(0.0, 1e4, 0.5))
+    monkeypatch.setattr(ros_images.time, "monotonic", lambda: float(next(now)))
+    images, node, warnings = _open([_image(1)], info=_info())
+    node.queues["/camera/camera_info"].batches = []
+    (frame,) = islice(images.frames(threading.Event()), 1)
+    with pytest.raises(CalibrationError, match="no calibration for 5 s; publish it, or give"):
+        frame.read()
+    node.queues["/camera/image_raw"].batches = [*[[]] * 60, [_image(2)]]
+    assert len(list(islice(images.frames(threading.Event()), 1))) == 1
+    (line,) = warnings
+    assert line.startswith("/camera/image_raw: no image for 10 s in ROS domain 0")
+
+
+@pytest.mark.parametrize("topic", ["", "/", "/a b", "/camera//image", "/1st", "/a" * 3 + "/"])
+def test_what_is_no_topic_is_refused(topic: str):
+    with pytest.raises(RecordingError, match="no topic of ROS"):
+        RosImages(Node(), f"ros:{topic}", True, print)

@@ -1,0 +1,200 @@
+"""The package for ROS: its files, its parameters, and its node with classes in place of rclpy's."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import runpy
+import sys
+import types
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from topoloc.apps.robots.config import RobotConfig
+from topoloc.apps.robots.ros_node import RobotPublisher
+from topoloc.errors import ConfigError
+from topoloc.geometry.rigid import Rigid3
+
+yaml = pytest.importorskip("yaml")
+PACKAGE = Path(__file__).parents[3] / "ros" / "topoloc_ros"
+
+
+@pytest.fixture
+def parameters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    yield importlib.import_module("topoloc_ros.parameters")
+    for name in [one for one in sys.modules if one.startswith("topoloc_ros")]:
+        del sys.modules[name]
+
+
+def test_what_is_installed_is_there(monkeypatch: pytest.MonkeyPatch):
+    given: dict[str, Any] = {}
+    monkeypatch.setattr("setuptools.setup", lambda **settings: given.update(settings))
+    monkeypatch.chdir(PACKAGE)
+    runpy.run_path("setup.py")
+    assert all(Path(file).is_file() for _, files in given["data_files"] for file in files)
+    installed = {Path(file).suffix for _, files in given["data_files"] for file in files}
+    assert {".xml", ".yaml", ".rviz", ".py"} <= installed
+    (command,) = given["entry_points"]["console_scripts"]
+    name, _, place = command.partition(" = ")
+    launch = (PACKAGE / "launch" / "localize.launch.py").read_text(encoding="utf-8")
+    assert f'executable="{name}"' in launch
+    module, _, function = place.partition(":")
+    tree = ast.parse((PACKAGE / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
+    assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_what_the_code_imports_is_depended_on():
+    root = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    assert root.findtext("name") == PACKAGE.name
+    depends = {one.text for one in root.iter("exec_depend")}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                top = node.module.partition(".")[0]
+                is_ros = top.endswith(("_msgs", "interfaces")) or top.startswith(("rcl", "launch"))
+                assert not is_ros or top in depends, f"{path.name}: {top}"
+
+
+def test_the_parameters_of_the_file_are_settings(parameters: Any):
+    data = yaml.safe_load((PACKAGE / "config" / "topoloc.yaml").read_text(encoding="utf-8"))
+    config = parameters.robot_config(data["topoloc"]["ros__parameters"])
+    assert config.planar
+    assert (config.odom_frame, config.domain) == ("odom", 0)
+
+
+def test_wrong_parameters_are_named(parameters: Any):
+    assert parameters.robot_config({"rate": 30, "use_sim_time": True}).rate == 30.0
+    with pytest.raises(ConfigError, match=r"parameter rate: must be from 1 to 1000, not 0\.5"):
+        parameters.robot_config({"rate": 0.5})
+    with pytest.raises(ConfigError, match="parameter odom: topoloc_ros has no such parameter"):
+        parameters.robot_config({"odom": "wheels"})
+
+
+def test_nav2_gets_no_second_localizer():
+    data = yaml.safe_load((PACKAGE / "config" / "nav2_params.yaml").read_text(encoding="utf-8"))
+    assert "amcl" not in data
+    assert data["lifecycle_manager_localization"]["ros__parameters"]["node_names"] == ["map_server"]
+    frames = RobotConfig()
+    costmap = data["global_costmap"]["global_costmap"]["ros__parameters"]
+    assert costmap["global_frame"] == frames.map_frame
+    assert costmap["robot_base_frame"] == frames.base_frame
+    assert costmap["transform_tolerance"] > frames.transform_tolerance
+
+
+def test_rviz_shows_the_pose_and_sets_the_initial_one():
+    data = yaml.safe_load((PACKAGE / "rviz" / "topoloc.rviz").read_text(encoding="utf-8"))
+    manager = data["Visualization Manager"]
+    topics = {one["Topic"]["Value"] for one in manager["Displays"] if "Topic" in one}
+    assert "/topoloc/pose" in topics
+    tools = {one["Class"]: one for one in manager["Tools"]}
+    assert tools["rviz_default_plugins/SetInitialPose"]["Topic"]["Value"] == "/initialpose"
+
+
+class Topics:
+    """A node of rclpy that keeps what is published."""
+
+    def __init__(self) -> None:
+        self.sent: dict[str, list[Any]] = {}
+        self.heard: dict[str, Callable[[Any], None]] = {}
+        self.context = types.SimpleNamespace(get_domain_id=lambda: 7)
+
+    def create_publisher(self, kind: Any, name: str, depth: int) -> Any:
+        return types.SimpleNamespace(publish=self.sent.setdefault(name, []).append)
+
+    def create_subscription(self, kind: Any, name: str, callback: Any, profile: Any) -> None:
+        self.heard[name] = callback
+
+
+def _message_class(kind: Any) -> type:
+    """A class as rosidl generates it: fields by name only, and octets as bytes."""
+    names = [one.name for one in fields(kind)]
+    octets = {"level"} if kind.__name__ == "DiagnosticStatus" else set()
+
+    class Message:
+        @classmethod
+        def get_fields_and_field_types(cls) -> dict[str, str]:
+            return {name: "octet" if name in octets else "other" for name in names}
+
+        def __init__(self, **values: Any) -> None:
+            assert set(values) == set(names)
+            assert all(isinstance(values[name], bytes) for name in octets)
+            self.__dict__.update(values)
+
+    Message.__name__ = kind.__name__
+    return Message
+
+
+@pytest.fixture
+def node_module(parameters: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    pytest.importorskip("cyclonedds", reason="the extra ros is not installed")
+    from topoloc.apps.robots import ros_messages
+
+    def fake(name: str, **members: Any) -> None:
+        module = types.ModuleType(name)
+        module.__dict__.update(members)
+        monkeypatch.setitem(sys.modules, name, module)
+
+    by_name = {
+        one.__name__: _message_class(one)
+        for one in vars(ros_messages).values()
+        if isinstance(one, type) and issubclass(one, ros_messages.IdlStruct) and fields_of(one)
+    }
+    policy = types.SimpleNamespace(BEST_EFFORT=1, TRANSIENT_LOCAL=2)
+    fake("rclpy", __path__=[])
+    fake("rclpy.executors", ExternalShutdownException=KeyboardInterrupt)
+    profile = types.SimpleNamespace
+    fake("rclpy.qos", DurabilityPolicy=policy, QoSProfile=profile, ReliabilityPolicy=policy)
+    for package in (
+        *("builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "rosgraph_msgs"),
+        *("sensor_msgs", "std_msgs", "tf2_msgs"),
+    ):
+        fake(package, __path__=[])
+        fake(f"{package}.msg", **by_name)
+    return importlib.import_module("topoloc_ros.node")
+
+
+def fields_of(kind: type) -> tuple[Any, ...]:
+    return fields(kind) if hasattr(kind, "__dataclass_fields__") else ()
+
+
+def test_the_node_publishes_messages_of_rclpy(node_module: Any):
+    topics = Topics()
+    publisher = RobotPublisher(node_module.RclpyNode(topics), RobotConfig())
+    pose = Rigid3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
+    publisher.send_pose(7_000_000_009, pose, np.eye(6))
+    publisher.send_transform(7_000_000_009, "odom", pose)
+    publisher.send_status(7_000_000_009, 2, "lost", {"state": "lost"})
+    (sent,), (tf,) = topics.sent["topoloc/pose"], topics.sent["/tf"]
+    assert (sent.header.stamp.sec, sent.header.stamp.nanosec) == (7, 9)
+    assert sent.pose.pose.position.x == pose.translation[0]
+    assert len(sent.pose.covariance) == 36
+    assert tf.transforms[0].transform.rotation.w == pose.quat_wxyz()[0]
+    (array,) = topics.sent["/diagnostics"]
+    assert array.status[0].level == b"\x02"
+
+
+def test_the_node_keeps_the_newest_messages(node_module: Any):
+    topics = Topics()
+    node = node_module.RclpyNode(topics)
+    reader = node.create_reader("/image", node.messages.Image, "sensor")
+    for number in range(8):
+        topics.heard["/image"](number)
+    assert reader.take(5) == [3, 4, 5, 6, 7]
+    assert reader.take(5) == []
+    assert node.domain == 7
+
+
+def test_an_initial_pose_is_published_once(node_module: Any):
+    topics, config = Topics(), RobotConfig(publish_initial_pose=True)
+    publisher = RobotPublisher(node_module.RclpyNode(topics), config)
+    for number in range(3):
+        publisher.send_pose(number, Rigid3.identity(), np.eye(6))
+    (initial,) = topics.sent["initialpose"]
+    assert initial is topics.sent["topoloc/pose"][0]
