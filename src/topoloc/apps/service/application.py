@@ -7,7 +7,7 @@ import contextlib
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,13 +103,14 @@ async def _error_response(request: Request, error: Exception) -> Response:
 
 @dataclass(frozen=True)
 class Address:
-    """Address of the service. It uses TLS if the files are given."""
+    """Address of the service. It uses TLS if the files are given. `on_ready` gets the port."""
 
     host: str
     port: int
     tls_cert: Path | None = None
     tls_key: Path | None = None
     behind_proxy: bool = False
+    on_ready: Callable[[int], None] = lambda _: None
 
 
 def serve(app: App, address: Address, limits: ServiceConfig) -> None:
@@ -136,6 +137,7 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
     host, port = listener.getsockname()[:2]
     shown = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
     print(f"topoloc serves on {shown}", file=sys.stderr, flush=True)
+    address.on_ready(port)
     asyncio.run(_Server(config).serve([listener]))
 
 
