@@ -19,11 +19,12 @@ from fastapi.responses import JSONResponse, Response
 
 import topoloc
 from topoloc import AtlasConfig, Localizer, MapCache, TopolocError, TrackerConfig
-from topoloc.apps.service import geopose_routes, map_routes, stream_routes
+from topoloc.apps.service import geopose_routes, map_routes, note_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
 from topoloc.apps.service.logs import Metrics, log, log_json
+from topoloc.apps.service.notes import NoteFiles
 from topoloc.apps.service.query_handler import ImageDecoder, QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, Streams, Workers
@@ -51,7 +52,8 @@ def create_application(
     )
     streams = Streams(maps, query_handler, tracking or TrackerConfig(), config)
     workers = Workers(config.num_workers, config.max_queue)
-    service = Service(maps, query_handler, workers, config, metrics, streams)
+    notes = NoteFiles(config.max_notes)
+    service = Service(maps, query_handler, workers, config, metrics, streams, notes)
     metrics.gauge("topoloc_jobs", "Requests in progress or waiting.", lambda: workers.num_jobs)
     metrics.gauge("topoloc_streams", "Open streams.", lambda: len(streams))
     metrics.gauge("topoloc_open_maps", "Open maps.", lambda: maps.num_open)
@@ -76,7 +78,7 @@ def create_application(
         redoc_url=None,
     )
     app.state.service = service
-    for routes in (map_routes, geopose_routes, stream_routes):
+    for routes in (map_routes, geopose_routes, note_routes, stream_routes):
         app.include_router(routes.router)
     for kind in (RequestError, HTTPException, RequestValidationError, 404, 405):
         app.add_exception_handler(kind, _error_response)

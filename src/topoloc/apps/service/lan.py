@@ -76,7 +76,7 @@ def _create_certificate(addresses: list[str]) -> tuple[bytes, bytes]:
     from cryptography.hazmat.primitives.asymmetric import ec
 
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "topoloc")])
+    name = x509.Name([x509.NameAttribute(x509.oid.NameOID.COMMON_NAME, "topoloc")])
     names = [_general_name(one) for one in dict.fromkeys([*addresses, "127.0.0.1", "localhost"])]
     builder = (
         x509.CertificateBuilder()
@@ -89,7 +89,7 @@ def _create_certificate(addresses: list[str]) -> tuple[bytes, bytes]:
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(
-            x509.ExtendedKeyUsage([x509.ExtendedKeyUsageOID.SERVER_AUTH]), critical=False
+            x509.ExtendedKeyUsage([x509.oid.ExtendedKeyUsageOID.SERVER_AUTH]), critical=False
         )
     )
     pem = serialization.Encoding.PEM
