@@ -36,7 +36,7 @@ export class Live {
       await shown();
       try {
         run.link ??= await this.opened(run);
-        const picture = await this.webcam.picture();
+        const picture = this.webcam.picture();
         this.told.took(picture);
         const answer = await run.link.ask(picture);
         faults = 0;

@@ -100,7 +100,13 @@ export class Sight {
     if (!width) return;
     const { scale, left, top } = this.fitted(width, height);
     context.drawImage(image, left, top, scale * width, scale * height);
-    if (seen) this.drawMap(context, this.view(), seen.lens);
+    if (!seen) return;
+    context.save();
+    context.beginPath();
+    context.rect(left, top, scale * width, scale * height);
+    context.clip();
+    this.drawMap(context, this.view(), seen.lens);
+    context.restore();
   }
 
   /** Where a point of the world is on the canvas: [x, y, depth] in pixels of the page, null out of sight. */

@@ -29,8 +29,8 @@ export class LiveView {
     const press = (name, on) => this.part(name).setAttribute("aria-pressed", String(on));
     this.part("close").addEventListener("click", () => this.close());
     this.part("again").addEventListener("click", () => this.follow());
-    this.part("explain").addEventListener("click", async () => {
-      const { file } = await this.webcam.picture();
+    this.part("explain").addEventListener("click", () => {
+      const { file } = this.webcam.picture();
       this.close();
       this.told.wanted(file);
     });
