@@ -27,7 +27,7 @@ _Point = Annotated[list[Finite], Meta(min_length=3, max_length=3)]
 
 class Note(Struct, frozen=True):
     """A note. Its position in the map's world (metres) is that of `point_cam`, which lies in the
-    axes of a node, so that the note stays in place when `topoloc level` or an update moves it."""
+    axes of a node, so that the note moves with the map when an edit moves it."""
 
     id: str
     text: Annotated[str, Meta(min_length=1, max_length=MAX_TEXT)]
