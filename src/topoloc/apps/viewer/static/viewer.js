@@ -18,6 +18,7 @@ export class Viewer {
     this.document = document_;
     element.classList.add("topoloc-scene");
     element.innerHTML = SHELL;
+    element.viewer = this;
     this.part = (name) => element.querySelector(`[data-part="${name}"]`);
     this.places = []; // what can be chosen: {key, label, group, centre, matrix, show}
     this.depth = frustumDepth(document_);
@@ -44,7 +45,6 @@ export class Viewer {
     this.fillList();
     this.listen();
     this.tellSummary();
-    element.viewer = this;
   }
 
   addMap() {

@@ -2,6 +2,8 @@
 
 let token = sessionStorage.getItem("topoloc token") ?? "";
 
+export const hasToken = () => token !== "";
+
 export function setToken(text) {
   token = text;
   sessionStorage.setItem("topoloc token", text);

@@ -1,6 +1,6 @@
 // The page at `/`: a picture goes in, and where it was taken comes out, in words and in the scene.
 import { AnswerList, linkTo, linkedAnswer } from "topoloc/page/answers";
-import { askAbout, mapNames, sceneOf, setToken } from "topoloc/page/asking";
+import { askAbout, hasToken, mapNames, sceneOf, setToken } from "topoloc/page/asking";
 import { drawMatches } from "topoloc/page/matches";
 import { Notes } from "topoloc/page/notes";
 import { LiveView } from "topoloc/page/view";
@@ -17,7 +17,7 @@ async function start() {
     state.names = await mapNames();
   } catch (error) {
     part("token-field").hidden = error.status !== 401;
-    if (error.status === 401 && !part("token").value) return part("token").focus();
+    if (error.status === 401 && !hasToken()) return part("token").focus();
     return tellFailure(error);
   }
   part("token-field").hidden = true;
