@@ -246,6 +246,21 @@ def test_a_stream_that_breaks_is_taken_up_again(phone: Phone):
         _wait(page, f"opened.length === 2 && {SIGHT}.seen !== null")
 
 
+def test_a_device_that_is_turned_is_followed_on(phone: Phone):
+    with live(phone) as page:
+        _wait(page, f"{SIGHT}.seen?.lens.width === 640")
+        page.evaluate(
+            f"""() => {{ const sight = {SIGHT}, {{ webcam }} = sight, take = webcam.picture.bind(webcam);
+            webcam.picture = () => {{ const whole = take();
+              const canvas = Object.assign(document.createElement("canvas"), {{ width: 400, height: 400 }});
+              canvas.getContext("2d").drawImage(whole.canvas, -120, 0);
+              const data = atob(canvas.toDataURL("image/jpeg", 0.9).split(",")[1]);
+              const file = new File([Uint8Array.from(data, (one) => one.charCodeAt(0))], "turned.jpg");
+              return {{ ...whole, canvas, file }}; }}; }}"""  # noqa: E501
+        )
+        _wait(page, f"{SIGHT}.seen?.lens.width === 400")
+
+
 def test_without_webgl_a_plan_shows_the_pose(phone: Phone):
     script = """const first = HTMLCanvasElement.prototype.getContext;
       HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {

@@ -10,7 +10,7 @@ const shown = () => document.hidden && new Promise((resolve) => document.addEven
 
 export class Live {
   /** `told.took(picture)` may add to each picture that is taken; `told.said(answer, picture, track)` gets its answer, and the way so far
-   * in lines; `told.failed(error)` is the end. */
+   * in lines; `told.waits(error)` why there is none for a moment, `told.failed(error)` for good. */
   constructor(webcam, told) {
     [this.webcam, this.told, this.run, this.track] = [webcam, told, null, [[]]];
   }
@@ -45,6 +45,7 @@ export class Live {
         if (this.run !== run) return;
         if (error.isOver || error.status === 404) run.link = null;
         if (++faults >= MAX_FAULTS || [401, 403, 422].includes(error.status)) throw error;
+        this.told.waits(error);
         await pause(1000 * (error.retryAfterS ?? 0) || PAUSE_MS);
       }
     }

@@ -91,6 +91,7 @@ function camera() {
 
 async function ask(file) {
   if (!state.map) return;
+  endLive();
   forgetPicture();
   const { signal } = (state.asked = new AbortController());
   const { map } = state;
@@ -233,6 +234,7 @@ const live = new LiveView(part("view"), {
     state.viewer?.showTrack(track);
   },
   ended: () => part("live").focus(),
+  failed: tellFailure,
   wanted: ask,
   written: (position) => notes.write(position),
   read: (note) => notes.read(note),
@@ -242,8 +244,11 @@ const notes = new Notes(part("notes"), part("note"), {
     live.setNotes(all);
     state.viewer?.showNotes(all);
   },
-  failed: (error) => (document.body.classList.contains("live") ? live.say(error.message, 4000, "bad") : tellFailure(error)),
+  failed: (error) => (isLive() ? live.say(error.message, 4000, "bad") : tellFailure(error)),
 });
+
+const isLive = () => document.body.classList.contains("live");
+const endLive = () => isLive() && live.close();
 
 function listenForLive() {
   part("live").addEventListener("click", () => {
@@ -252,7 +257,7 @@ function listenForLive() {
     live.open(state.map, camera()).catch(tellFailure);
   });
   const change = () => {
-    if (document.body.classList.contains("live")) live.close();
+    endLive();
     openMap();
   };
   part("map").addEventListener("change", () => {

@@ -9,7 +9,7 @@ const SAID_MS = 4000;
 const CLICK_PX = 10;
 
 export class LiveView {
-  /** `told.said(answer, track)` gets each answer, `told.ended()` the end; `told.wanted(file)` an image that is to be explained;
+  /** `told.said(answer, track)` gets each answer, `told.ended()` the end, `told.failed(error)` why it does not begin again; `told.wanted(file)` an image that is to be explained;
    * `told.written(position)` and `told.read(note)` what is tapped. */
   constructor(section, told) {
     Object.assign(this, { section, told, times: [], heldUntil: 0 });
@@ -20,6 +20,7 @@ export class LiveView {
     this.live = new Live(this.webcam, {
       took: (picture) => (picture.turn = this.motion.now()),
       said: (answer, picture, track) => this.hear(answer, picture, track),
+      waits: (error) => this.say(error.message, 0, "bad"),
       failed: (error) => this.fail(error),
     });
     this.listen();
@@ -28,7 +29,7 @@ export class LiveView {
   listen() {
     const press = (name, on) => this.part(name).setAttribute("aria-pressed", String(on));
     this.part("close").addEventListener("click", () => this.close());
-    this.part("again").addEventListener("click", () => this.follow());
+    this.part("again").addEventListener("click", () => this.open(this.map, this.camera).catch(this.told.failed));
     this.part("explain").addEventListener("click", () => {
       const { file } = this.webcam.picture();
       this.close();
@@ -49,6 +50,8 @@ export class LiveView {
 
   /** To be called from a tap, as iOS lends its motion sensor to taps alone. */
   async open(map, camera) {
+    this.live.stop();
+    this.webcam.close();
     const sensor = this.motion.start();
     Object.assign(this, { map, camera });
     this.section.hidden = false;

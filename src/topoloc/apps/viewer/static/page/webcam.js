@@ -45,6 +45,7 @@ export class Webcam {
   /** Keep the screen on; a browser drops its lock when the page is hidden. */
   async keepAwake() {
     if (!this.isOn || document.hidden) return;
+    this.video.play().catch(() => {}); // iOS stops it with the page
     this.lock = await navigator.wakeLock?.request("screen").catch(() => null);
     if (!this.isOn) this.lock?.release();
   }
@@ -52,6 +53,7 @@ export class Webcam {
   /** What the camera sees now: {canvas, file, time}, the time in ms since 1970. */
   picture() {
     const { videoWidth, videoHeight } = this.video;
+    if (!videoWidth || !this.video.srcObject?.active) throw new Error("The camera gives no images.");
     const scale = Math.min(1, MAX_SIDE / Math.max(videoWidth, videoHeight));
     const [width, height] = [videoWidth, videoHeight].map((side) => Math.round(side * scale));
     const canvas = Object.assign(document.createElement("canvas"), { width, height });
