@@ -8,11 +8,11 @@ const NEIGHBOURS = 24; // cells across the image, in which a point far behind ot
 const HIDDEN = 1.5; // times as deep
 const MAX_NODES = 40;
 const MAX_CROP = 1.4; // more is not cut off to fill the screen
-const TAP_PX = 26;
+const TAP_PX = 20;
 
 export class Sight {
   constructor(canvas, webcam, motion) {
-    Object.assign(this, { canvas, webcam, motion, points: new Float32Array(), nodes: [], notes: [], showsPoints: true });
+    Object.assign(this, { canvas, webcam, motion, points: new Float32Array(), nodes: [], notes: [], labels: [], showsPoints: true });
     canvas.sight = this;
     this.forget();
     new ResizeObserver(() => (this.isStale = true)).observe(canvas);
@@ -92,7 +92,7 @@ export class Sight {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
     this.isStale = false;
-    this.drawn = [];
+    [this.drawn, this.labels] = [[], []];
     const { video } = this.webcam;
     const image = seen ? seen.picture.canvas : video;
     const [width, height] = [image.videoWidth ?? image.width, image.videoHeight ?? image.height];
@@ -165,18 +165,17 @@ export class Sight {
     context.moveTo(x, y);
     context.lineTo(x, y - 18);
     context.stroke();
-    context.fillRect(x - 12, y - 42, width, 24);
+    const left = Math.max(4, Math.min(x - 12, this.canvas.clientWidth - width - 4));
+    context.fillRect(left, y - 42, width, 24);
     context.fillStyle = COLOURS.ground;
-    context.fillText(text, x - 4, y - 25);
+    context.fillText(text, left + 8, y - 25);
+    this.labels.push({ note, depth: at[2], left, right: left + width, top: y - 42, bottom: y + TAP_PX });
   }
 
   /** The note at these pixels of the canvas, undefined without one. */
   noteAt(x, y) {
-    if (!this.seen) return undefined;
-    const view = this.view();
-    const near = this.notes.map((note) => ({ note, at: this.placed(view, this.seen.lens, note.position) })).filter(({ at }) => at);
-    const isHit = ({ at }) => Math.abs(at[0] - x) < TAP_PX && y - at[1] < TAP_PX && at[1] - y < TAP_PX + 30;
-    return near.filter(isHit).sort((a, b) => a.at[2] - b.at[2])[0]?.note;
+    const hit = this.labels.filter(({ left, right, top, bottom }) => x > left && x < right && y > top && y < bottom);
+    return hit.sort((a, b) => a.depth - b.depth)[0]?.note;
   }
 
   /** The place of the map at these pixels of the canvas. Throws where there is none. */
@@ -184,7 +183,9 @@ export class Sight {
     if (!this.seen) throw new Error("A note needs a pose. Look at a place of the map first.");
     const { lens } = this.seen;
     const { scale, left, top } = this.fitted(lens.width, lens.height);
-    const place = placeAt(this.view(), lens, this.points, [(x - left) / scale - 0.5, (y - top) / scale - 0.5]);
+    const [u, v] = [(x - left) / scale - 0.5, (y - top) / scale - 0.5];
+    const isInside = u >= 0 && v >= 0 && u < lens.width && v < lens.height;
+    const place = isInside ? placeAt(this.view(), lens, this.points, [u, v]) : null;
     if (!place) throw new Error("The map has no points there. Tap where points are drawn.");
     return place;
   }
