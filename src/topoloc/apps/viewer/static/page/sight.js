@@ -151,7 +151,7 @@ export class Sight {
   }
 
   drawNote(context, note, at) {
-    if (!at) return;
+    if (!at || at[0] < 0 || at[0] > this.canvas.clientWidth) return;
     const [x, y] = at;
     const text = note.text.length > 36 ? `${note.text.slice(0, 35)}…` : note.text;
     context.font = "600 14px system-ui, sans-serif";
