@@ -21,6 +21,7 @@ from topoloc.demo.recordings import SHIPPED, find_missing_recordings
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.image_io import EncodedImage, read_image
 from topoloc.recordings.open import open_sequence
 
 pytestmark = pytest.mark.skipif(
@@ -65,12 +66,12 @@ def phone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
         folder / "lab.topo"
     )
     walk = open_sequence(SHIPPED / "day")
-    images = [cv2.imread(str(SHIPPED / "day" / walk.names[i])) for i in FRAMES]
     video = folder / "walk.y4m"
     with video.open("wb") as file:
         file.write(b"YUV4MPEG2 W640 H400 F1:1 Ip A1:1 C420mpeg2\n")
-        for image in images:
-            file.write(b"FRAME\n" + cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420).tobytes())
+        for i in FRAMES:
+            yuv = cv2.cvtColor(walk[i].image, cv2.COLOR_RGB2YUV_I420)
+            file.write(b"FRAME\n" + yuv.tobytes())
     options = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
     with (
         running(folder, "--workers", 1) as service,
@@ -107,10 +108,9 @@ def _wait(page: Any, condition: str, seconds: float = 60.0) -> None:
 
 def _errors(phone: Phone, shown: dict[str, Any]) -> np.ndarray:
     """How far the drawn points are from where truth puts them, pixels of the image."""
-    data = np.frombuffer(base64.b64decode(shown["image"].partition(",")[2]), np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE).astype(float)
-    known = {i: cv2.cvtColor(phone.walk[i].image, cv2.COLOR_BGR2GRAY) for i in FRAMES}
-    i = min(FRAMES, key=lambda i: float(np.abs(known[i] - image).mean()))
+    data = base64.b64decode(shown["image"].partition(",")[2])
+    image = read_image(EncodedImage("drawn", data))[:, :, :3].astype(float)
+    i = min(FRAMES, key=lambda i: float(np.abs(phone.walk[i].image - image).mean()))
     camera, pose = phone.walk[i].camera, phone.walk.poses[i]
     assert camera is not None
     assert pose is not None
@@ -270,7 +270,7 @@ def test_without_webgl_a_plan_shows_the_pose(phone: Phone):
         page.get_by_text("This is the plan from above.").wait_for(state="attached")
         _wait(page, "document.getElementById('scene').viewer.plan?.answer?.localized")
         canvas = page.locator("#scene canvas").screenshot()
-        image = cv2.imdecode(np.frombuffer(canvas, np.uint8), cv2.IMREAD_COLOR_RGB)
+        image = read_image(EncodedImage("plan", canvas))[:, :, :3]
         places = np.argwhere((image == [255, 61, 129]).all(axis=2))
         assert len(places) > 50
         assert (np.abs(places.mean(axis=0) / image.shape[:2] - 0.5) < 0.48).all()
