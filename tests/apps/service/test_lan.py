@@ -16,6 +16,8 @@ import httpx
 import numpy as np
 import pytest
 from running_service import TOKEN, Running, running
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from topoloc.apps.service import lan
 
@@ -49,6 +51,22 @@ def test_the_certificate_is_of_the_address_of_the_link(
         assert not urlsplit(address).hostname.startswith("127.")  # pyright: ignore[reportOptionalMemberAccess]
         assert service.end() == 0
         assert list(tmp_path.glob("topoloc-lan-*")) == []
+
+
+def test_a_websocket_over_tls_ends_without_a_word(room_map: Path, tmp_path: Path):
+    config = tmp_path / "limits.toml"
+    config.write_text("[serve]\nupload_s = 1.0\n")
+    with running(room_map, "--lan", "--config", config) as service:
+        address, token = _link(service)
+        trusting = ssl.create_default_context()
+        trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+        where = f"{address.replace('https', 'wss')}/v1/maps/{room_map.stem}/sessions"
+        protocols = [Subprotocol("topoloc"), Subprotocol(f"bearer.{token}")]
+        with connect(where, ssl=trusting, subprotocols=protocols) as stream:
+            assert stream.subprotocol == "topoloc"
+        time.sleep(2.0)
+        assert service.end() == 0
+        assert [line for line in service.log if '"level": "error"' in line] == []
 
 
 def test_a_token_that_is_given_is_that_of_the_link(room_map: Path, tmp_path: Path):
