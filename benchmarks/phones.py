@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import threading
 import time
 from dataclasses import dataclass, field
@@ -71,18 +72,27 @@ def main() -> None:
             threading.Thread(target=phone, args=(of, args.map.stem, images, n, args, answers))
             for n in range(args.phones)
         ]
+        before = _processor_s(of.pid)
         for job in jobs:
             job.start()
         for job in jobs:
             job.join()
+        processor_ms = 1e3 * (_processor_s(of.pid) - before) / max(1, len(answers.seconds))
     ms, settled = 1e3 * np.array(answers.seconds), np.array(answers.due) >= args.settle
     for label, chosen in ((f"first {args.settle:g} s", ms[~settled]), ("then", ms[settled])):
         p50, p99, most = np.percentile(chosen, [50, 99, 100]) if len(chosen) else (0, 0, 0)
         print(f"{label}: {len(chosen)} answers, p50 {p50:.0f}, p99 {p99:.0f}, most {most:.0f} ms")
     print(
         f"{args.phones} phones at {args.hz:g} Hz: {answers.num_localized} of {len(ms)} localized,"
-        f" {answers.num_late} images left out because the last answer was late"
+        f" {answers.num_late} images left out because the last answer was late;"
+        f" {processor_ms:.0f} ms of a processor for each answer"
     )
+
+
+def _processor_s(pid: int) -> float:
+    """Processor time of a process so far, which a busy machine does not change."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from running_service import Running, running
 
 from in_browser import CONTRASTS, UNNAMED, chromium
 from topoloc.demo.recordings import SHIPPED, find_missing_recordings
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.frame import StereoSequence
@@ -260,6 +262,70 @@ def test_a_device_that_is_turned_is_followed_on(phone: Phone):
               return {{ ...whole, canvas, file }}; }}; }}"""  # noqa: E501
         )
         _wait(page, f"{SIGHT}.seen?.lens.width === 400")
+
+
+CAMERAS = (
+    Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.0, 235.0)),
+    Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 235.0, -0.2)),
+    Camera("OPENCV", 640, 480, (500.0, 510.0, 320.0, 235.0, -0.2, 0.05, 0.001, -0.002)),
+    Camera(
+        "FULL_OPENCV",
+        640,
+        480,
+        (500.0, 510.0, 320.0, 235.0, 0.1, 0.05, 0.001, -0.002, 0.01, 0.2, 0.02, 0.01),
+    ),
+    Camera("OPENCV_FISHEYE", 640, 480, (300.0, 310.0, 320.0, 235.0, 0.02, -0.01, 0.003, -0.001)),
+    Camera("FISHEYE", 640, 480, (300.0, 310.0, 320.0, 235.0)),
+)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=[one.model for one in CAMERAS])
+def test_points_are_projected_as_the_camera_does(phone: Phone, camera: Camera):
+    rng = np.random.default_rng(0)
+    pose = Rigid3.from_json({"translation": [1.0, -2.0, 0.5], "quat_wxyz": [0.5, 0.5, -0.5, 0.5]})
+    points_img = rng.uniform([20, 20], [620, 460], (50, 2))
+    rays = camera.rays_from_img(points_img)
+    depths = rng.uniform(0.5, 8.0, (50, 1))
+    points = pose.apply(rays / rays[:, 2:] * depths)
+    page = phone.browser.new_page()
+    page.goto(phone.service.url)
+    there, back = page.evaluate(
+        """async ([pose, camera, points]) => {
+          const { lensOf, projected, unprojected, viewOf } =
+            await import("topoloc/page/projection");
+          const [view, lens] = [viewOf(pose), lensOf(camera)];
+          const there = points.map((point) => projected(view, lens, point));
+          return [there, there.map(([u, v, depth]) => unprojected(view, lens, [u, v], depth))];
+        }""",
+        [pose.to_json(), camera.to_json(), points.tolist()],
+    )
+    np.testing.assert_allclose(there, np.hstack([points_img, depths]), atol=0.01)
+    np.testing.assert_allclose(back, points, atol=0.01)
+    page.close()
+
+
+def test_a_note_lies_on_the_surface_in_front(phone: Phone):
+    """Of two walls and a stray point before them, the nearer wall is meant."""
+    side = np.arange(-2.0, 2.01, 0.05)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+    walls = [np.stack([x, y, np.full(x.size, z)], axis=1) for z in (3.0, 6.0)]
+    points = np.concatenate([*walls, [[0.0, 0.0, 1.0]]])
+    page = phone.browser.new_page()
+    page.goto(phone.service.url)
+    places = page.evaluate(
+        """async (points) => {
+          const { lensOf, placeAt, viewOf } = await import("topoloc/page/projection");
+          const view = viewOf({ translation: [0, 0, 0], quat_wxyz: [1, 0, 0, 0] });
+          const lens = lensOf({ width: 640, height: 480, f: 500, cx: 320, cy: 240 });
+          const at = (pixel) => placeAt(view, lens, Float32Array.from(points), pixel);
+          return [at([320, 240]), at([420, 240]), at([-300, 240])];
+        }""",
+        points.ravel().tolist(),
+    )
+    np.testing.assert_allclose(places[0], [0, 0, 3], atol=1e-6)
+    np.testing.assert_allclose(places[1], [0.6, 0, 3], atol=1e-6)
+    assert places[2] is None
+    page.close()
 
 
 def test_without_webgl_a_plan_shows_the_pose(phone: Phone):

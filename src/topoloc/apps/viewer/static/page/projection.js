@@ -56,7 +56,7 @@ export function projected({ rotation: r, translation: t }, lens, [px, py, pz]) {
 export function unprojected({ rotation: r, translation: t }, lens, [u, v], depth) {
   const [a, b] = [(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy];
   let [x, y] = [a, b];
-  for (let i = 0; lens.distort && i < 30; i++) {
+  for (let i = 0; lens.distort && i < 200; i++) {
     const [c, d] = lens.distort(x, y);
     [x, y] = [x + a - c, y + b - d];
   }
