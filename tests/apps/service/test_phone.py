@@ -218,6 +218,27 @@ def test_the_motion_sensor_turns_the_map_between_answers(phone: Phone):
         np.testing.assert_allclose(up[:, 2], [0, -aside, ahead], atol=0.01)
 
 
+def test_the_motion_sensor_is_read_in_every_position_of_the_screen(phone: Phone):
+    """Upright towards the north: portrait, and turned by 90 degrees to the left and right."""
+    page = phone.browser.new_page()
+    page.goto(phone.service.url)
+    seen = page.evaluate(
+        """async () => {
+          const { Motion } = await import("topoloc/page/webcam");
+          const motion = new Motion();
+          return [[0, 90, 0, 0], [90, 0, -90, 90], [-90, 0, 90, 270]].map(([alpha, beta, gamma, angle]) => {
+            Object.defineProperty(screen, "orientation", { value: { angle }, configurable: true });
+            motion.hear({ alpha, beta, gamma });
+            return motion.now();
+          });
+        }"""  # noqa: E501
+    )
+    # rows of east, north, up; columns of right, down, forward
+    for one in seen:
+        np.testing.assert_allclose(one, [1, 0, 0, 0, 0, 1, 0, -1, 0], atol=1e-9)
+    page.close()
+
+
 @pytest.mark.parametrize(
     ("script", "said"),
     [
