@@ -19,7 +19,7 @@ from topoloc.apps.service.openapi_schemas import error_responses
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 
-router = APIRouter()
+router = APIRouter(tags=["notes"])
 R = TypeVar("R")
 _Text = StringConstraints(strip_whitespace=True, min_length=1, max_length=MAX_TEXT)
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
@@ -35,10 +35,15 @@ class NewNote(BaseModel):
     position: _Position
 
 
-class NoteFacts(BaseModel):
-    """A note. `geopose` is its place on earth, if the map has one, upright towards the east."""
+class NoteId(BaseModel):
+    """The id of a note that was added."""
 
     id: str
+
+
+class NoteFacts(NoteId):
+    """A note. `geopose` is its place on earth, if the map has one, upright towards the east."""
+
     text: str
     created: str
     position: _Position
@@ -54,10 +59,10 @@ class NoteList(BaseModel):
 
 @router.get(
     "/v1/maps/{map}/notes",
-    responses=error_responses(401, 404, 422, 429, 503),
+    responses=error_responses(401, 403, 404, 422, 429, 503),
     response_model_exclude_none=True,
 )
-async def notes(request: Request, map: MapName) -> NoteList:
+async def list_notes(request: Request, map: MapName) -> NoteList:
     """Return the notes of a map."""
     service = get_service(request)
     found = await _with_map(request, map, service.notes.list_notes)
@@ -69,12 +74,12 @@ async def notes(request: Request, map: MapName) -> NoteList:
     status_code=201,
     responses=error_responses(401, 403, 404, 409, 422, 429, 503),
 )
-async def add_note(request: Request, map: MapName, note: NewNote) -> dict[str, str]:
+async def add_note(request: Request, map: MapName, note: NewNote) -> NoteId:
     """Add a note, and return its id."""
     service = get_service(request)
     _check_is_file(service, map)
     add = partial(service.notes.add, text=note.text, position=note.position)
-    return {"id": await _with_map(request, map, add)}
+    return NoteId(id=await _with_map(request, map, add))
 
 
 @router.delete(
