@@ -42,7 +42,7 @@ UNNAMED = """() => [...document.querySelectorAll("button, input:not([hidden]), s
 
 
 @contextmanager
-def chromium() -> Iterator[Any]:
+def chromium(*options: str) -> Iterator[Any]:
     """The browser, as Playwright's `Browser`."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = next(
@@ -57,7 +57,7 @@ def chromium() -> Iterator[Any]:
         pytest.skip("no Chromium is installed")
     with api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(
-            executable_path=program, args=["--no-sandbox", *_SOFTWARE_3D]
+            executable_path=program, args=["--no-sandbox", *_SOFTWARE_3D, *options]
         )
         yield browser
         browser.close()

@@ -29,6 +29,7 @@ FOREIGN = (
     "torchvision",
     "mitsuba",
     "matplotlib",
+    "cryptography",
     "cyclonedds",
     "carla",
     "pyzed",

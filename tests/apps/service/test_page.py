@@ -250,7 +250,7 @@ def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):
                     " document.activeElement.tagName"
                 )
             )
-        assert {"choose", "webcam", "SUMMARY", "canvas", "home", "list"} <= reached
+        assert {"choose", "live", "SUMMARY", "canvas", "home", "list"} <= reached
         with page.expect_file_chooser():
             page.locator("#choose").focus()
             page.keyboard.press("Enter")
@@ -273,8 +273,7 @@ def test_a_live_stream_draws_the_way(lab: Lab, browser: Any):
         )
         page.locator("#camera-field summary").click()
         page.get_by_label("fx, fy, cx, cy in pixels").last.fill(lab.camera)
-        page.get_by_text("Use the webcam").click()
-        page.get_by_text("Follow live").click()
+        page.get_by_text("Live camera").click()
         track = (
             "document.getElementById('scene').viewer.live.children.flatMap((group) =>"
             " group.children).length"
@@ -286,10 +285,10 @@ def test_a_live_stream_draws_the_way(lab: Lab, browser: Any):
         assert page.evaluate(track) > 0, page.inner_text("#answer")
         assert "State of the stream" in page.inner_text("#answer")
         assert np.linalg.norm(_frustum(page) - lab.true.translation) < 0.02
-        page.get_by_text("Follow live").click()
-        assert page.locator("#live").get_attribute("aria-pressed") == "false"
-        page.get_by_text("Webcam off").click()
-        assert page.locator("#video").is_hidden()
+        page.get_by_role("button", name="Explain").click()
+        page.wait_for_selector("#matches:not([hidden])", timeout=60_000)
+        assert page.locator("#view").is_hidden()
+        assert page.inner_text("#answer h2").startswith("Here, at")
 
 
 def test_the_token_is_asked_for(room_map: Path, tmp_path: Path, browser: Any):

@@ -7,7 +7,7 @@ import contextlib
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator, Collection, Iterator
+from collections.abc import AsyncIterator, Callable, Collection, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +20,19 @@ from fastapi.responses import JSONResponse, Response
 
 import topoloc
 from topoloc import AtlasConfig, Localizer, MapCache, TopolocError, TrackerConfig
-from topoloc.apps.service import discovery_routes, geopose_routes, map_routes, stream_routes
+from topoloc.apps.service import (
+    discovery_routes,
+    geopose_routes,
+    map_routes,
+    note_routes,
+    stream_routes,
+)
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
 from topoloc.apps.service.cross_origin import CrossOrigin
 from topoloc.apps.service.logs import Metrics, log, log_json
+from topoloc.apps.service.notes import NoteFiles
 from topoloc.apps.service.openapi_schemas import complete_document
 from topoloc.apps.service.query_handler import ImageDecoder, QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
@@ -55,7 +62,8 @@ def create_application(
     )
     streams = Streams(maps, query_handler, tracking or TrackerConfig(), config)
     workers = Workers(config.num_workers, config.max_queue)
-    service = Service(maps, query_handler, workers, config, metrics, streams)
+    notes = NoteFiles(config.max_notes)
+    service = Service(maps, query_handler, workers, config, metrics, streams, notes)
     metrics.gauge("topoloc_jobs", "Requests in progress or waiting.", lambda: workers.num_jobs)
     metrics.gauge("topoloc_streams", "Open streams.", lambda: len(streams))
     metrics.gauge("topoloc_open_maps", "Open maps.", lambda: maps.num_open)
@@ -82,7 +90,7 @@ def create_application(
         generate_unique_id_function=lambda route: route.name,
     )
     app.state.service = service
-    for routes in (map_routes, geopose_routes, stream_routes, discovery_routes):
+    for routes in (map_routes, geopose_routes, note_routes, stream_routes, discovery_routes):
         app.include_router(routes.router)
     for kind in (RequestError, HTTPException, RequestValidationError, 404, 405):
         app.add_exception_handler(kind, _error_response)
@@ -118,13 +126,14 @@ async def _error_response(request: Request, error: Exception) -> Response:
 
 @dataclass(frozen=True)
 class Address:
-    """Address of the service. It uses TLS if the files are given."""
+    """Address of the service. It uses TLS if the files are given. `on_ready` gets the port."""
 
     host: str
     port: int
     tls_cert: Path | None = None
     tls_key: Path | None = None
     behind_proxy: bool = False
+    on_ready: Callable[[int], None] = lambda _: None
 
 
 def serve(app: App, address: Address, limits: ServiceConfig) -> None:
@@ -151,6 +160,7 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
     host, port = listener.getsockname()[:2]
     shown = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
     print(f"topoloc serves on {shown}", file=sys.stderr, flush=True)
+    address.on_ready(port)
     asyncio.run(_Server(config).serve([listener]))
 
 

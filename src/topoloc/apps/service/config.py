@@ -39,6 +39,8 @@ class ServiceConfig:
     """Streams of one address at a time."""
     session_idle_s: Annotated[float, Between(0.01, 1e6)] = 60.0
     """Seconds without an image after which a stream ends."""
+    max_notes: Annotated[int, Between(0, 100_000)] = 1000
+    """Notes at places of a map, in NAME.notes.json beside it. 0: none are kept."""
     drain_s: Annotated[float, AtLeast(0)] = 20.0
     """Seconds that requests in progress may take after the service is told to end."""
 

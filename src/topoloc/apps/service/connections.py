@@ -155,6 +155,8 @@ class _HttpProtocol(_TimedProtocol, H11Protocol):
     def handle_websocket_upgrade(self, event: RequestHead) -> None:
         self.connections_open.remove(self)
         self._cancel_write_timer()
+        if self._head_timer is not None:
+            self._head_timer.cancel()
         super().handle_websocket_upgrade(event)
 
     def _wait_for_head(self, seconds: float) -> None:

@@ -39,10 +39,6 @@ MapName = Annotated[
     str, Path(description="name of a map: its file name without .topo", max_length=200)
 ]
 UrlParameters = Annotated[QueryParameters, Query()]
-_PAGE_MODULES = MODULES | {
-    f"topoloc/page/{name}": f"page/{name}.js"
-    for name in ("page", "answers", "asking", "live", "matches")
-}
 _TYPES = {
     ".js": "text/javascript",
     ".css": "text/css",
@@ -249,7 +245,9 @@ async def static(name: str) -> Response:
 @cache
 def _render_page() -> tuple[str, str]:
     """Return the page and its content security policy, which allows this service only."""
-    element = import_map(lambda file: f"/static/{file}", _PAGE_MODULES)
+    files = [file for file in sorted(_list_static_files()) if file.startswith("page/")]
+    modules = {f"topoloc/{file[:-3]}": file for file in files if file.endswith(".js")}
+    element = import_map(lambda file: f"/static/{file}", MODULES | modules)
     inside = element[element.index(">") + 1 : element.rindex("<")]
     digest = base64.b64encode(sha256(inside.encode()).digest()).decode("ascii")
     policy = (

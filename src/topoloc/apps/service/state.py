@@ -31,6 +31,7 @@ from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import while_connected
 from topoloc.apps.service.discovery_messages import Announced
 from topoloc.apps.service.logs import Metrics, log
+from topoloc.apps.service.notes import NoteFiles
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError, to_request_error
@@ -219,6 +220,7 @@ class Service:
     config: ServiceConfig
     metrics: Metrics
     streams: Streams
+    notes: NoteFiles
     scenes: dict[str, tuple[tuple[int, ...], bytes]] = field(default_factory=dict)
     announced: tuple[float, list[Announced]] | None = None
     num_awaiting: int = 0

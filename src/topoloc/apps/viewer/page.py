@@ -30,6 +30,7 @@ MODULES = {
     "topoloc/measure": "measure.js",
     "topoloc/objects": "objects.js",
     "topoloc/overlay": "overlay.js",
+    "topoloc/plan": "plan.js",
     "topoloc/stage": "stage.js",
     "topoloc/apps/viewer": "viewer.js",
     "topoloc/words": "words.js",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -114,6 +115,9 @@ class Command:
     ] = ()
     """Origin whose pages may ask, as https://app.example; repeat it for more. `*`, any page, needs
     --token-file."""
+    lan: Flag = False
+    """For phones in this network: listen on its addresses, make a certificate and a token for this
+    run, and print the link and its QR code."""
     features: QUERY_FEATURES = None
     memory_mb: Annotated[int | None, option("N", "512")] = None
     """Megabytes of maps in memory. The least recently used map is closed first."""
@@ -132,6 +136,22 @@ class Command:
     def run(self) -> int:
         if not self.maps:
             raise UsageError("serve takes at least one map, folder of maps or atlas")
+        if not self.lan:
+            return self._run()
+        from topoloc.apps.service import lan
+
+        if self.ray is not None or self.behind_proxy:
+            raise UsageError("--lan is for one process that speaks TLS: no --ray, --behind-proxy")
+        self._check_pair()
+        host = "0.0.0.0" if self.host in _LOOPBACK else self.host
+        addresses = lan.find_lan_addresses(host)
+        with lan.create_lan_files(addresses) as made:
+            token_file = self.token_file or made.token
+            cert, key = self.tls_cert or made.tls_cert, self.tls_key or made.tls_key
+            command = replace(self, host=host, token_file=token_file, tls_cert=cert, tls_key=key)
+            return command._run(lambda port: lan.print_links(addresses, port, token_file))
+
+    def _run(self, on_ready: Callable[[int], None] = lambda _: None) -> int:
         self._check_access()
         if self.ray is None and self.replicas is not None:
             raise UsageError("--replicas belongs to --ray")
@@ -146,7 +166,7 @@ class Command:
             return self._run_on_ray(self.ray, settings, config)
         cert, key = (None if path is None else Path(path) for path in (self.tls_cert, self.tls_key))
         app = self._serve(settings, config).application()
-        serve(app, Address(self.host, self.port, cert, key, self.behind_proxy), config)
+        serve(app, Address(self.host, self.port, cert, key, self.behind_proxy, on_ready), config)
         return 0
 
     def _run_on_ray(self, ray: str, settings: Settings, config: ServiceConfig) -> int:
@@ -188,16 +208,20 @@ class Command:
             raise UsageError(f"--replicas {self.replicas[:40]}: more at least than at most")
         return config
 
-    def _check_access(self) -> None:
-        """Refuse other machines without a token, or without TLS."""
+    def _check_pair(self) -> None:
         if (self.tls_cert is None) != (self.tls_key is None):
             raise UsageError("--tls-cert and --tls-key go together")
+
+    def _check_access(self) -> None:
+        """Refuse other machines without a token, or without TLS."""
+        self._check_pair()
         if ANY_ORIGIN in self._origins() and self.token_file is None:
             raise UsageError("--allow-origin *: any page could ask: --token-file FILE is needed")
         is_private = self.host in _LOOPBACK and not self.behind_proxy
         if not is_private and self.token_file is None:
             raise UsageError(
-                f"--host {self.host} is reached from elsewhere: --token-file FILE is needed"
+                f"--host {self.host} is reached from elsewhere: --token-file FILE (or --lan) is"
+                " needed"
             )
         if self.host not in _LOOPBACK and self.tls_cert is None and not self.behind_proxy:
             raise UsageError(

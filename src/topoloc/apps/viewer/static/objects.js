@@ -7,7 +7,7 @@ import { centreCovariance, ellipsoidMatrix, matrixOf, numbersOf, pictureCorners 
 import { isLocalized } from "topoloc/words";
 
 const SET_COLOURS = ["#12a594", "#7c6ff0", "#d9822b", "#3f8fe0", "#94ad12", "#c95fc2"];
-export const COLOURS = { node: "#5f86bd", path: "#5f86bd", alternative: "#f0a202", bad: "#e5484d", error: "#f0a202", selected: "#ff3d81" };
+export const COLOURS = { node: "#5f86bd", path: "#5f86bd", alternative: "#f0a202", bad: "#e5484d", error: "#f0a202", selected: "#ff3d81", note: "#d9a400" };
 
 /** Colours of the axes x, y and z. */
 export const AXIS_COLOURS = ["#d6404a", "#2f9e44", "#2f7fe0"];
@@ -16,10 +16,10 @@ export const AXIS_COLOURS = ["#d6404a", "#2f9e44", "#2f7fe0"];
 export const setColour = (n) => SET_COLOURS[n % SET_COLOURS.length];
 
 /** Points with the colours of the pictures that show them. */
-export function cloudOf(points, pixels) {
+export function cloudOf(positions, coloursBase64, pixels) {
   const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(numbersOf(points.world, Float32Array), 3));
-  const rgb = numbersOf(points.rgb, Uint8Array);
+  geometry.setAttribute("position", new BufferAttribute(positions, 3));
+  const rgb = numbersOf(coloursBase64, Uint8Array);
   const linear = new Float32Array(rgb.length);
   const levels = Float32Array.from({ length: 256 }, (_, level) => new Color().setRGB(level / 255, 0, 0, SRGBColorSpace).r);
   for (let i = 0; i < rgb.length; i++) linear[i] = levels[rgb[i]];
@@ -65,14 +65,20 @@ export function axesOf(length) {
   return group;
 }
 
+/** Marks at positions, in front of all else. */
+export function marksOf(positions, colour) {
+  const geometry = new BufferGeometry().setAttribute("position", new Float32BufferAttribute(positions.flat(), 3));
+  const marks = new Points(geometry, new PointsMaterial({ color: colour, depthTest: false, size: 9, sizeAttenuation: false }));
+  marks.renderOrder = 1;
+  return marks;
+}
+
 /** One or two points and the line between them, in front of all else. */
 export function ruleOf(ends) {
   const geometry = new BufferGeometry().setAttribute("position", new Float32BufferAttribute(ends.flat(), 3));
-  const settings = { color: COLOURS.selected, depthTest: false };
-  const marks = new Points(geometry, new PointsMaterial({ ...settings, size: 9, sizeAttenuation: false }));
-  const group = new Group().add(marks, new Line(geometry, new LineBasicMaterial(settings)));
-  group.children.forEach((one) => (one.renderOrder = 1));
-  return group;
+  const line = new Line(geometry, new LineBasicMaterial({ color: COLOURS.selected, depthTest: false }));
+  line.renderOrder = 1;
+  return new Group().add(marksOf(ends, COLOURS.selected), line);
 }
 
 /** A picture (address or canvas) where the camera's frustum ends, `depth` metres before it. `drawn` is called when it is there. */

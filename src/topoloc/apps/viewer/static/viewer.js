@@ -1,14 +1,16 @@
 // The viewer: a scene document in an element of a page, with its layers, its list of pictures, and what is known of the one that is chosen.
 import { Group } from "three";
-import { matrixOf } from "topoloc/geometry";
+import { matrixOf, numbersOf } from "topoloc/geometry";
 import { Measure } from "topoloc/measure";
 import * as objects from "topoloc/objects";
 import { showScale } from "topoloc/overlay";
+import { Plan } from "topoloc/plan";
 import { Stage } from "topoloc/stage";
 import { isLocalized, pointText, sentences, verdict } from "topoloc/words";
 
 const PICK_PX = 22;
 const MAX_PICTURES = 400;
+const NOTES = "Notes";
 
 export class Viewer {
   /** Show a document in `element`, which is emptied. */
@@ -16,19 +18,24 @@ export class Viewer {
     this.document = document_;
     element.classList.add("topoloc-scene");
     element.innerHTML = SHELL;
+    element.viewer = this;
     this.part = (name) => element.querySelector(`[data-part="${name}"]`);
     this.places = []; // what can be chosen: {key, label, group, centre, matrix, show}
     this.depth = frustumDepth(document_);
+    this.points = numbersOf(document_.points.world, Float32Array);
     try {
       const wheelZooms = element.classList.contains("whole");
       this.stage = new Stage(this.part("canvas"), { ...document_, wheelZooms }, (x, y) => this.pick(x, y));
     } catch {
-      this.part("details").textContent = "This browser shows no 3-D: WebGL is missing or switched off.";
+      element.classList.add("flat");
+      this.part("details").textContent = "This browser shows no 3-D: WebGL is missing or switched off. This is the plan from above.";
+      this.plan = new Plan(this.part("canvas"), document_, this.points);
       return;
     }
     this.chosen = new Group();
     this.live = new Group();
-    this.stage.scene.add(this.chosen, this.live);
+    this.notes = new Group();
+    this.stage.scene.add(this.chosen, this.live, this.notes);
     this.addMap();
     document_.results.forEach((set, n) => this.addResults(set, objects.setColour(n)));
     this.layer("axes", objects.axesOf(0.1 * this.stage.size()), "axes at the origin");
@@ -38,12 +45,11 @@ export class Viewer {
     this.fillList();
     this.listen();
     this.tellSummary();
-    element.viewer = this;
   }
 
   addMap() {
     const { points, nodes, paths, map } = this.document;
-    this.cloud = objects.cloudOf(points, 2);
+    this.cloud = objects.cloudOf(this.points, points.rgb, 2);
     this.layer("points", this.cloud, `${map.num_points_shown.toLocaleString("en")} points`);
     const cameras = nodes.map((node) => ({ matrix: matrixOf(node.world_from_cam), camera: node.camera }));
     const frustums = objects.frustumsOf(cameras, this.depth, objects.COLOURS.node, { opacity: 0.6 });
@@ -108,6 +114,7 @@ export class Viewer {
 
   /** Show another result, such as a live one, instead of the selected one. */
   showLive(answer, options) {
+    if (this.plan) return this.plan.show({ answer });
     this.clearChosen();
     this.part("list").value = "";
     this.showAnswer(answer, options);
@@ -117,9 +124,26 @@ export class Viewer {
 
   /** The trajectory of a live stream: positions [[x, y, z], ...] in lines. */
   showTrack(lines) {
+    if (this.plan) return this.plan.show({ track: lines });
     objects.dispose(this.live);
     this.live.clear();
     this.live.add(objects.linesOf(lines, objects.COLOURS.selected));
+    this.stage.draw();
+  }
+
+  /** Notes {id, text, position} at places of the map, instead of those before. */
+  showNotes(notes) {
+    if (this.plan) return this.plan.show({ notes });
+    objects.dispose(this.notes);
+    this.notes.clear();
+    if (notes.length) this.notes.add(objects.marksOf(notes.map((note) => note.position), objects.COLOURS.note));
+    const others = this.places.filter((place) => place.group !== NOTES);
+    const places = notes.map((note) => {
+      const show = () => this.tell("Note", [note.text, `At ${pointText(note.position)}.`]);
+      return { key: `note ${note.id}`, label: note.text.slice(0, 60), group: NOTES, centre: note.position, show };
+    });
+    this.places.splice(0, this.places.length, ...others, ...places); // the measure holds the list
+    this.fillList();
     this.stage.draw();
   }
 
@@ -155,12 +179,15 @@ export class Viewer {
 
   fillList() {
     const list = this.part("list");
+    const { value } = list;
+    list.querySelectorAll("optgroup").forEach((group) => group.remove());
     const groups = [...new Set(this.places.map((place) => place.group))].reverse();
     for (const name of groups) {
       const group = Object.assign(document.createElement("optgroup"), { label: name });
       for (const place of this.places.filter((one) => one.group === name)) group.append(new Option(place.label, place.key));
       list.append(group);
     }
+    list.value = this.places.some((place) => place.key === value) ? value : "";
   }
 
   listen() {

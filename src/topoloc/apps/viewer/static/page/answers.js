@@ -51,10 +51,15 @@ export class AnswerList {
   }
 
   save(ending, text) {
-    const href = URL.createObjectURL(new Blob([text], { type: "text/plain" }));
-    Object.assign(document.createElement("a"), { href, download: `${this.map}.${ending}` }).click();
-    setTimeout(() => URL.revokeObjectURL(href), 10_000); // the browser reads it after the click
+    saveText(`${this.map}.${ending}`, text);
   }
+}
+
+/** Give a text to the user as a file. */
+export function saveText(download, text) {
+  const href = URL.createObjectURL(new Blob([text], { type: "text/plain" }));
+  Object.assign(document.createElement("a"), { href, download }).click();
+  setTimeout(() => URL.revokeObjectURL(href), 10_000); // the browser reads it after the click
 }
 
 /** Photos have no times, so their numbers are the seconds. */

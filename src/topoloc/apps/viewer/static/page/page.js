@@ -1,8 +1,9 @@
 // The page at `/`: a picture goes in, and where it was taken comes out, in words and in the scene.
 import { AnswerList, linkTo, linkedAnswer } from "topoloc/page/answers";
-import { askAbout, mapNames, sceneOf, setToken } from "topoloc/page/asking";
-import { Live } from "topoloc/page/live";
+import { askAbout, hasToken, mapNames, sceneOf, setToken } from "topoloc/page/asking";
 import { drawMatches } from "topoloc/page/matches";
+import { Notes } from "topoloc/page/notes";
+import { LiveView } from "topoloc/page/view";
 import { Viewer, pictureAddress } from "topoloc/apps/viewer";
 import { isLocalized, sentences, verdict } from "topoloc/words";
 
@@ -16,7 +17,7 @@ async function start() {
     state.names = await mapNames();
   } catch (error) {
     part("token-field").hidden = error.status !== 401;
-    if (error.status === 401 && !part("token").value) return part("token").focus();
+    if (error.status === 401 && !hasToken()) return part("token").focus();
     return tellFailure(error);
   }
   part("token-field").hidden = true;
@@ -34,8 +35,9 @@ async function openMap() {
   const wanted = wantedMap();
   forgetPicture();
   part("answer").replaceChildren();
-  state.viewer?.stage.renderer.forceContextLoss(); // a browser lends a page few of them
+  state.viewer?.stage?.renderer.forceContextLoss(); // a browser lends a page few of them
   [state.viewer, state.asked] = [null, null];
+  notes.follow("");
   state.map = state.names.includes(wanted) ? wanted : "";
   part("map").value = state.map;
   answers.show(state.map);
@@ -48,8 +50,10 @@ async function openMap() {
   try {
     const scene = await sceneOf(state.map);
     if (scene.name !== state.map) return;
-    const viewer = new Viewer(part("scene"), scene);
-    [state.mapId, state.viewer] = [scene.map.id, viewer.stage ? viewer : null];
+    state.viewer = new Viewer(part("scene"), scene);
+    state.mapId = scene.map.id;
+    live.setMap(state.viewer.points, scene.nodes, state.viewer.depth);
+    notes.follow(state.map);
     if (state.shown) state.viewer?.showLive(state.shown.result, drawnAs(state.shown));
     else if (!state.asked) showLinked();
   } catch (error) {
@@ -87,6 +91,7 @@ function camera() {
 
 async function ask(file) {
   if (!state.map) return;
+  endLive();
   forgetPicture();
   const { signal } = (state.asked = new AbortController());
   const { map } = state;
@@ -220,36 +225,39 @@ function listenForCamera() {
   });
 }
 
-function listenForWebcam() {
-  const live = new Live(part("video"), {
-    said: (answer, track) => {
-      part("answer").setAttribute("aria-live", "off"); // several a second: nobody could listen to them
-      tellResult(answer);
-      state.viewer?.showLive(answer, { title: "live", follow: false, quiet: true });
-      state.viewer?.showTrack(track);
-    },
-    failed: tellFailure,
-    ended: () => press("live", false),
-  });
-  const press = (id, on) => part(id).setAttribute("aria-pressed", String(on));
-  part("webcam").addEventListener("click", async () => {
-    const on = await live.toggleWebcam().catch((error) => tellFailure(error));
-    for (const id of ["video", "shoot", "live"]) part(id).hidden = !on;
-    press("webcam", Boolean(on));
-    part("webcam").textContent = on ? "Webcam off" : "Use the webcam";
-  });
-  part("shoot").addEventListener("click", async () => {
-    press("live", false);
-    live.stop();
-    ask(await live.picture());
-  });
+const live = new LiveView(part("view"), {
+  said: (answer, track) => {
+    part("answer").setAttribute("aria-live", "off"); // several a second: nobody could listen to them
+    tellResult(answer);
+    if (!part("scene").checkVisibility()) return;
+    state.viewer?.showLive(answer, { title: "live", follow: false, quiet: true });
+    state.viewer?.showTrack(track);
+  },
+  ended: () => part("live").focus(),
+  failed: tellFailure,
+  wanted: ask,
+  written: (position) => notes.write(position),
+  read: (note) => notes.read(note),
+});
+const notes = new Notes(part("notes"), part("note"), {
+  changed: (all) => {
+    live.setNotes(all);
+    state.viewer?.showNotes(all);
+  },
+  failed: (error) => (isLive() ? live.say(error.message, 4000, "bad") : tellFailure(error)),
+});
+
+const isLive = () => document.body.classList.contains("live");
+const endLive = () => isLive() && live.close();
+
+function listenForLive() {
   part("live").addEventListener("click", () => {
+    if (!state.map) return;
     forgetPicture();
-    press("live", live.toggle(state.map, camera()));
+    live.open(state.map, camera()).catch(tellFailure);
   });
   const change = () => {
-    live.stop();
-    press("live", false);
+    endLive();
     openMap();
   };
   part("map").addEventListener("change", () => {
@@ -269,5 +277,5 @@ part("token-field").addEventListener("submit", (event) => {
 });
 listenForPictures();
 listenForCamera();
-listenForWebcam();
+listenForLive();
 start();
