@@ -5,13 +5,18 @@ from __future__ import annotations
 
 import math
 import socket
+import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from topoloc import Localization, StreamedPose, open_sequence
+from topoloc.apps.cli import main
 from topoloc.apps.robots.mavlink import (
+    DroneLocalizer,
     MavlinkPublisher,
     body_of_forward_camera,
     encode_frame,
@@ -217,3 +222,60 @@ def test_what_is_no_address_is_said_in_a_sentence(address: str):
 def test_a_host_that_is_unknown_is_named():
     with pytest.raises(TopolocError, match=r"^udpout:nowhere\.invalid:14550: "):
         MavlinkPublisher("udpout:nowhere.invalid:14550")
+
+
+def _received(receiver: socket.socket) -> list[tuple[int, np.ndarray, int]]:
+    """Time (microseconds), position (forward, right, down) and reset counter of what came."""
+    receiver.settimeout(0.3)
+    found = []
+    with suppress(TimeoutError):
+        while True:
+            payload = receiver.recv(300)[10:-2].ljust(233, b"\0")
+            fields = struct.unpack("<Q55f4Bb", payload)
+            found.append((fields[0], np.array(fields[1:4]), fields[-3]))
+    return found
+
+
+def _answer(t_ns: int, x: float, probability: float = 0.95) -> StreamedPose:
+    pose = _pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), x, 0.0, 1.0)
+    result = Localization(pose, 1e-4 * np.eye(6), probability, 0, [], 90, 80, {"total": 9.0})
+    return StreamedPose(t_ns, "localized", result, pose, 1e-4 * np.eye(6))
+
+
+def test_a_jump_is_sent_once_three_images_agree_on_it():
+    warnings = list[str]()
+    with _receiver() as receiver:
+        drone = DroneLocalizer(f"udpout:127.0.0.1:{receiver.getsockname()[1]}", warnings.append)
+        xs = [0.0, 0.1, 0.2, 0.3, 20.0, 0.4, 20.0, 20.1, 20.2, 20.3]
+        for number, x in enumerate(xs):
+            drone.take(_answer(100_000_000 * number, x, 0.5 if number == 9 else 0.95))
+        found = _received(receiver)
+        drone.close()
+    sent = {(t_us // 100_000, round(float(at[0]), 3), resets) for t_us, at, resets in found}
+    assert sent == {(2, 0.2, 0), (3, 0.3, 0), (5, 0.4, 0), (8, 20.2, 1)}
+    assert warnings == []
+
+
+def test_a_pose_is_repeated_while_it_is_new():
+    with _receiver() as receiver:
+        drone = DroneLocalizer(f"udpout:127.0.0.1:{receiver.getsockname()[1]}", print)
+        for number in range(3):
+            drone.take(_answer(number, 0.0))
+        found = _received(receiver)
+        drone.close()
+    assert 3 <= len(found) <= 8
+    assert {t_us for t_us, *_ in found} == {0}
+
+
+def test_follow_sends_what_it_localizes(room_map: Path, tiny_recording: Path):
+    sequence = open_sequence(tiny_recording)
+    with _receiver() as receiver:
+        address = f"udpout:127.0.0.1:{receiver.getsockname()[1]}"
+        assert main(["follow", str(room_map), str(tiny_recording), "--mavlink", address]) == 0
+        found = {t_us: at for t_us, at, _ in _received(receiver)}
+    truth = {t_ns // 1000: pose for t_ns, pose in zip(sequence.t_ns, sequence.poses, strict=True)}
+    assert len(found) >= 10
+    for t_us, at in found.items():
+        pose = truth[t_us]
+        assert pose is not None
+        assert np.linalg.norm(at * [1.0, -1.0, -1.0] - pose.translation) < 0.03

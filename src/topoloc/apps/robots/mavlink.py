@@ -4,6 +4,9 @@ The map is level (`topoloc level`): its z axis points up. Its frame and that of 
 forward, y left, z up here, and x forward, y right, z down on the wire (MAV_FRAME_LOCAL_FRD,
 MAV_FRAME_BODY_FRD). Whoever publishes repeats the last pose at 10 Hz or more, which estimators of
 autopilots expect.
+
+Only poses that images measured are sent. A pose that does not continue the last one must be
+confirmed by the images after it, and is then announced as a reset.
 """
 
 from __future__ import annotations
@@ -12,12 +15,15 @@ import math
 import re
 import socket
 import struct
+import threading
+import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc import Rigid3, TopolocError
+from topoloc import Localization, Rigid3, StreamedPose, TopolocError
 
 _ADDRESS = re.compile(r"udp(in|out):(\[[^\]]+\]|[^:\[\]]+):([0-9]{1,5})")
 
@@ -129,3 +135,74 @@ class MavlinkPublisher:
 
     def close(self) -> None:
         self._socket.close()
+
+
+class DroneLocalizer:
+    """Sends the poses of a stream of images of a camera that looks ahead, until it is closed.
+    `warn` gets one line if they cannot be sent."""
+
+    def __init__(self, address: str, warn: Callable[[str], None]) -> None:
+        self._publisher, self._warn = MavlinkPublisher(address), warn
+        self._last: Localization | None = None  # as sent
+        self._last_ns, self._received = 0, 0.0
+        self._doubted: list[tuple[int, Rigid3]] = []  # successive poses that do not continue it
+        self._lock, self._is_closed = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._repeat, name="mavlink", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._is_closed.set()
+        self._thread.join(1.0)
+        self._publisher.close()
+
+    def take(self, answer: StreamedPose) -> None:
+        """Take the answer for an image. It is sent if it is measured, probable, and continues the
+        last pose or is confirmed."""
+        min_probability, num_confirming = 0.8, 3
+        result = answer.result
+        if not isinstance(result, Localization) or answer.is_repeated:
+            return
+        if result.probability < min_probability:
+            return
+        pose, last = result.world_from_cam, self._last
+        is_next = last is not None and _continues(
+            self._last_ns, last.world_from_cam, answer.t_ns, pose
+        )
+        if not is_next:
+            if self._doubted and not _continues(*self._doubted[-1], answer.t_ns, pose):
+                self._doubted = []
+            self._doubted.append((answer.t_ns, pose))
+            if len(self._doubted) < num_confirming:
+                return
+        is_reset = not is_next and last is not None
+        with self._lock:
+            self._doubted, self._last, self._last_ns = [], result, answer.t_ns
+            self._received = time.monotonic()
+            self._send(is_reset)
+
+    def _send(self, is_reset: bool) -> None:
+        if self._last is None:
+            return
+        body = body_of_forward_camera(self._last.world_from_cam)
+        covariance, p = self._last.covariance, self._last.probability
+        try:
+            self._publisher.publish(self._last_ns, body, covariance, p, is_reset)
+        except TopolocError as error:
+            self._warn(str(error))
+            self._is_closed.set()
+
+    def _repeat(self) -> None:
+        """Send the last pose again while it is new; runs in the thread."""
+        interval, max_age = 0.08, 0.5  # seconds
+        while not self._is_closed.wait(interval):
+            with self._lock:
+                if self._last is not None and time.monotonic() - self._received < max_age:
+                    self._send(is_reset=False)
+
+
+def _continues(before_ns: int, before: Rigid3, t_ns: int, pose: Rigid3) -> bool:
+    """Return whether a drone can have come from one pose to the other."""
+    least_m, speed, least_rad, turn = 0.3, 5.0, 0.3, 3.0  # metres per second, radians per second
+    seconds = max(t_ns - before_ns, 0) / 1e9
+    return pose.is_same(before, least_m + speed * seconds, least_rad + turn * seconds)

@@ -89,6 +89,7 @@ _TAGS = [
     {"name": "geopose", "description": "The OSCP GeoPose Protocol."},
     {"name": "discovery", "description": "Maps of a region, by SpatialDDS 1.6."},
     {"name": "maps", "description": "What maps hold."},
+    {"name": "notes", "description": "Texts at places of a map."},
     {"name": "service", "description": "Health, features and counters."},
 ]
 OBJECT_RESPONSE: dict[int | str, dict[str, Any]] = {

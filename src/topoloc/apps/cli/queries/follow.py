@@ -8,10 +8,12 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from topoloc import (
     AtlasConfig,
+    Localizer,
     LocalizerConfig,
     StereoSequence,
     Tracker,
@@ -34,6 +36,7 @@ from topoloc.apps.cli.queries.query_answers import QueryFrame, capture_frames, f
 from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.config import RobotConfig
+from topoloc.apps.robots.mavlink import DroneLocalizer
 from topoloc.apps.robots.robot_localizer import RobotLocalizer
 from topoloc.apps.robots.ros_images import RosImages, is_topic
 from topoloc.apps.robots.ros_node import RosNode
@@ -69,6 +72,9 @@ class Command:
     to topoloc_camera."""
     planar: Flag = False
     """With --ros: publish x, y and yaw only."""
+    mavlink: Annotated[str | None, option("udpout:HOST:PORT")] = None
+    """Send the poses to an autopilot, as ODOMETRY of a drone whose camera looks ahead. Or
+    `udpin:HOST:PORT`, to whoever writes to this port."""
     config: File = None
     """TOML file with all other settings, as printed by `topoloc config follow`."""
 
@@ -77,8 +83,8 @@ class Command:
         localizer = open_localizer(
             self.map, settings.of(LocalizerConfig), self.features, settings.of(AtlasConfig)
         )
-        if self.ros and len(localizer.tile_ids) > 1:
-            raise UsageError("--ros publishes poses of one world, and tiles have their own")
+        if self.ros or self.mavlink is not None:
+            self._check_world(localizer)
         with ExitStack() as stack:
             tracker = stack.enter_context(closing(Tracker(localizer, settings.of(TrackerConfig))))
             stop = stack.enter_context(catch_stop_signals())
@@ -98,6 +104,9 @@ class Command:
             if node is not None and self.ros:
                 robot = RobotLocalizer(node, config, images, print_warning)
                 stack.enter_context(closing(robot))
+            drone = None
+            if self.mavlink is not None:
+                drone = stack.enter_context(closing(DroneLocalizer(self.mavlink, print_warning)))
             for frame in frames:
                 if stop.is_set():
                     break
@@ -105,8 +114,22 @@ class Command:
                     answer = frame.localize(tracker.cameras, tracker, of_size)
                 else:
                     answer = robot.localize(frame, tracker, of_size)
+                if drone is not None and answer.streamed is not None:
+                    drone.take(answer.streamed)
                 print_line(format_answer(answer) if self.plain else json.dumps(answer.to_json()))
         return 0
+
+    def _check_world(self, localizer: Localizer) -> None:
+        """Warn if z of the map does not point up. Raises UsageError: it has several worlds."""
+        if len(localizer.tile_ids) > 1:
+            raise UsageError("robots need poses of one world, and tiles have their own")
+        axes = [one.world_from_cam.rotation[2, 1] for one in localizer.topomap.summaries]
+        max_tilt = 40.0  # degrees of the mean camera
+        if axes and np.degrees(np.arccos(-np.mean(axes))) > max_tilt:
+            print_warning(
+                f"{self.map}: z does not point up in this map, as robots expect; `topoloc level"
+                f" {self.map}` makes it so"
+            )
 
     def _robot_config(self, config: RobotConfig) -> RobotConfig:
         given = [

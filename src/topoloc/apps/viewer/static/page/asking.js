@@ -55,7 +55,7 @@ const nanoseconds = (ms) => `${BigInt(Math.round(1e3 * ms))}000`;
 /** A stream over a WebSocket: `ask({file, time})` sends an image after the last answer, and gives its answer. */
 export function openSocket(map, camera) {
   // A browser cannot send headers with it, so the token is one of its subprotocols.
-  const protocols = ["topoloc", ...(token ? [`bearer.${token}`] : [])];
+  const protocols = ["topoloc", ...(token ? [`bearer.${encodeURIComponent(token)}`] : [])];
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   const socket = new WebSocket(`${scheme}://${location.host}${addressOf(map)}/sessions`, protocols);
   let [resolve, reject] = [null, null];
