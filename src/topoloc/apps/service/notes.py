@@ -54,9 +54,12 @@ class NoteFiles:
         """Return the notes of the map in this file as JSON, the oldest first. Raises RequestError:
         their file is damaged."""
         file = _read(path)
+        notes = file.notes if file and file.map == topomap.id else []
+        if not notes:
+            return []
         poses: dict[int, Rigid3] = {one.node_id: one.world_from_cam for one in topomap.summaries}
         found = list[dict[str, Any]]()
-        for note in file.notes if file and file.map == topomap.id else ():
+        for note in notes:
             pose = poses.get(note.node)
             position = note.position if pose is None else pose.apply(np.array(note.point_cam))
             shown = {"id": note.id, "text": note.text, "created": note.created}
