@@ -1,7 +1,7 @@
 """The places that weights are fitted to: what is mapped, and what it is asked about.
 
 The demo's lab ships; the other rendered recordings are made by `topoloc simulate`
-(docs/benchmarks.md has the commands); kitchen, ZED lab and KITTI are those of `../shared/data`.
+(paper/README.md has the commands); kitchen, ZED lab and KITTI are those of `../shared/data`.
 What is missing is left out, with a line.
 """
 
