@@ -180,10 +180,12 @@ class GrowingMap:
     ) -> TopoMetricMap:
         """Return the map with the content of these frames, in its one session."""
         *_, session = topomap.sessions
-        frames = select_posed_frames(view, session.session_id)
+        posed = select_posed_frames(view, session.session_id)
+        # The others show what these show, too. Describing an image takes as long as its odometry.
+        frames = [one for one in posed if one.index in session_poses.answers or one.index % 3 == 0]
         content = create_session_content(topomap, frames, session_poses, _no_progress)
-        piece = create_session(view, frames, "slam", session.camera, content.lights)
-        changed = add_session(topomap, piece, frames, content)
+        piece = create_session(view, posed, "slam", session.camera, content.lights)
+        changed = add_session(topomap, piece, posed, content)
         changed, _ = update_coarse_models(changed, content.views, content.images)
         changed = replace(changed, sessions=[replace(session, end_ns=piece.end_ns)])
         return carry_over_error_shares(changed, topomap)
