@@ -39,9 +39,6 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
 from topoloc.slam.slam import run_slam
 
-_NUM_SHARED = 12
-"""Frames that a piece shares with the last one."""
-
 
 @dataclass(frozen=True)
 class _Piece:
@@ -103,10 +100,10 @@ class GrowingMap:
             CalibrationError, UnreadableImageError: from reading the recording.
             MapError: the map cannot be written.
         """
-        began = time.monotonic()
+        began, num_shared = time.monotonic(), 12  # frames that a piece shares with the one before
         stop = len(sequence) if stop is None else stop
         before, self._end = self._end, stop
-        self._apart.append(_Piece(max(0, before - _NUM_SHARED), before, stop))
+        self._apart.append(_Piece(max(0, before - num_shared), before, stop))
         num_posed, shift, newest = 0, 0.0, self._world_from_cams
         while self._apart:  # the newest piece, then those before it, which share frames with it
             joined = self._join(sequence, self._apart[-1])

@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 from running_service import Running, running
 
 from schemas import strict_object
-from topoloc.apps.service.discovery_messages import (
+from topoloc.apps.service.protocols.discovery_messages import (
     Announced,
     boxes_intersect,
     enclose,

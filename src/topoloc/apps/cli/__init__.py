@@ -1,8 +1,7 @@
 """The command line: `topoloc COMMAND`. A command's module is imported when it is called.
 
 Other distributions add commands with an entry point of the group `topoloc.commands`: a dictionary
-like `COMMANDS`; and settings with one of `topoloc.settings`, like `TABLES` of settings_file.py.
-"""
+like `COMMANDS`; and settings with one of `topoloc.settings`, like `TABLES` of settings_file.py."""
 
 from __future__ import annotations
 
@@ -17,8 +16,7 @@ from io import TextIOWrapper
 from os import PathLike
 from typing import Any, TextIO
 
-# NumPy reads this when it is imported. Threads of BLAS wait in busy loops, which costs more than
-# they gain here, and the last digits would depend on the number of processors.
+# NumPy reads this when imported. Threads of BLAS cost more than they gain, and change last digits.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _GROUPS = {

@@ -20,13 +20,7 @@ from fastapi.responses import JSONResponse, Response
 
 import topoloc
 from topoloc import AtlasConfig, Localizer, MapCache, TopolocError, TrackerConfig
-from topoloc.apps.service import (
-    discovery_routes,
-    geopose_routes,
-    map_routes,
-    note_routes,
-    stream_routes,
-)
+from topoloc.apps.service import map_routes, note_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
@@ -34,6 +28,7 @@ from topoloc.apps.service.cross_origin import CrossOrigin
 from topoloc.apps.service.logs import Metrics, log, log_json
 from topoloc.apps.service.notes import NoteFiles
 from topoloc.apps.service.openapi_schemas import complete_document
+from topoloc.apps.service.protocols import discovery_routes, geopose_routes
 from topoloc.apps.service.query_handler import ImageDecoder, QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, Streams, Workers

@@ -16,7 +16,6 @@ from pydantic import BaseModel
 
 import topoloc
 from topoloc import Camera
-from topoloc.apps.service.discovery_messages import SPATIALDDS
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
     OBJECT_RESPONSE,
@@ -27,6 +26,7 @@ from topoloc.apps.service.openapi_schemas import (
     named_response,
     result_response,
 )
+from topoloc.apps.service.protocols.discovery_messages import SPATIALDDS
 from topoloc.apps.service.query_handler import combine_results, result_to_line
 from topoloc.apps.service.query_request import read_query_request
 from topoloc.apps.service.request_errors import RequestError

@@ -12,10 +12,10 @@ from fastapi.responses import Response
 from pydantic import BaseModel, Field, StringConstraints
 
 from topoloc import TopoMetricMap
-from topoloc.apps.service.geopose_messages import GeoPoseOgc
 from topoloc.apps.service.map_routes import MapName
 from topoloc.apps.service.notes import MAX_TEXT
 from topoloc.apps.service.openapi_schemas import error_responses
+from topoloc.apps.service.protocols.geopose_messages import GeoPoseOgc
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct, to_builtins
 
 from topoloc import Rigid3, TopolocError, TopoMetricMap
-from topoloc.apps.service.geopose_messages import GeoPoseOgc, Position, Quaternion
+from topoloc.apps.service.protocols.geopose_messages import GeoPoseOgc, Position, Quaternion
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.plugin import Finite, decode_json, write_text
 

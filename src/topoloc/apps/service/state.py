@@ -29,9 +29,9 @@ from topoloc import (
 )
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import while_connected
-from topoloc.apps.service.discovery_messages import Announced
 from topoloc.apps.service.logs import Metrics, log
 from topoloc.apps.service.notes import NoteFiles
+from topoloc.apps.service.protocols.discovery_messages import Announced
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError, to_request_error

@@ -36,8 +36,6 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.apps.cli.settings_file import read_settings
 
-_POLL_S = 0.2
-
 
 @dataclass(frozen=True)
 class Command:
@@ -134,7 +132,7 @@ class Command:
             elif is_ended:
                 return
             else:
-                time.sleep(_POLL_S)
+                time.sleep(0.2)
             if self.live and len(more := self._reopen(sequence)) > len(sequence):
                 sequence, last = more, time.monotonic()
 
@@ -155,7 +153,7 @@ class Command:
             except TopolocError:
                 if stop.is_set() or time.monotonic() - began > self.idle:
                     raise
-                time.sleep(_POLL_S)
+                time.sleep(0.2)
 
     def _reopen(self, sequence: StereoSequence) -> StereoSequence:
         """Return the recording with its new frames, if it can be read at this moment."""

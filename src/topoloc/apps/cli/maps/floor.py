@@ -15,7 +15,6 @@ from jaxtyping import Float
 from topoloc import MapError, TopoMetricMap
 
 _CELL = 0.25  # metres; a plane counts cells, so a textured table weighs no more than its area
-_MIN_CELLS = 12
 _CAMERA_SIGMA = math.radians(10.0)  # of the mean up direction of a camera in the hand
 _TOLERANCE = 0.03  # metres
 _NO_FLOOR = (
@@ -45,7 +44,7 @@ def find_floor(topomap: TopoMetricMap, up_world: Float[np.ndarray, "3"] | None =
     Raises:
         MapError: no floor is seen, or too little to level the map by it.
     """
-    max_tilt_sigma, num_steps = math.radians(1.5), 8
+    max_tilt_sigma, num_steps, min_cells = math.radians(1.5), 8, 12
     is_exact = up_world is not None
     mean = -np.mean([one.world_from_cam.rotation[:, 1] for one in topomap.summaries], axis=0)
     up = mean / np.linalg.norm(mean) if up_world is None else up_world
@@ -54,7 +53,7 @@ def find_floor(topomap: TopoMetricMap, up_world: Float[np.ndarray, "3"] | None =
     offset, sigma, inside = _lowest_level(points, best), 0.0, points
     for _ in range(num_steps):
         inside = points[np.abs(points @ best - offset) < _TOLERANCE]
-        if len(inside) == 0 or _num_cells(inside, best) < _MIN_CELLS:
+        if len(inside) == 0 or _num_cells(inside, best) < min_cells:
             raise MapError(_NO_FLOOR)
         if is_exact:
             offset = float(np.median(inside @ best))

@@ -17,7 +17,9 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import ValidationError
 
 from topoloc import MapError, TopoMetricMap
-from topoloc.apps.service.discovery_messages import (
+from topoloc.apps.service.logs import log
+from topoloc.apps.service.openapi_schemas import OBJECT_RESPONSE, error_responses, request_body
+from topoloc.apps.service.protocols.discovery_messages import (
     SEARCH_EXAMPLE,
     Announced,
     SearchRequest,
@@ -25,9 +27,7 @@ from topoloc.apps.service.discovery_messages import (
     enclose,
     parse_resource,
 )
-from topoloc.apps.service.geopose_messages import ROUTE
-from topoloc.apps.service.logs import log
-from topoloc.apps.service.openapi_schemas import OBJECT_RESPONSE, error_responses, request_body
+from topoloc.apps.service.protocols.geopose_messages import ROUTE
 from topoloc.apps.service.query_request import read_body
 from topoloc.apps.service.request_errors import RequestError, invalid_request
 from topoloc.apps.service.state import Service, get_service

@@ -21,7 +21,8 @@ from topoloc import (
     TopoMetricMap,
     UncalibratedCamera,
 )
-from topoloc.apps.service.geopose_messages import (
+from topoloc.apps.service.openapi_schemas import error_responses, request_body
+from topoloc.apps.service.protocols.geopose_messages import (
     EXAMPLE,
     MEDIA_TYPE,
     ROUTE,
@@ -36,7 +37,6 @@ from topoloc.apps.service.geopose_messages import (
     read_image_size,
     read_request,
 )
-from topoloc.apps.service.openapi_schemas import error_responses, request_body
 from topoloc.apps.service.query_handler import fit_camera
 from topoloc.apps.service.query_request import camera_from_json, parse_camera_field, read_body
 from topoloc.apps.service.request_errors import RequestError
