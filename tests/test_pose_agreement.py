@@ -14,7 +14,10 @@ PREDICATE, ENGINE = "geometry/rigid.py", "geometry/transform_consensus.py"
 # Hypotheses of a stream consist of a pose and a velocity.
 OTHER_TESTS = {"tracking/motion.py:_is_same_motion"}
 # It draws triples of points. `find_least_median` compares their transforms.
-OTHER_ENGINES = {"mapping/georeferencing.py:_robust_weights"}
+OTHER_ENGINES = {
+    "mapping/georeferencing.py:_robust_weights",
+    "apps/cli/maps/floor.py:_sample_normal",  # it searches a plane, no transform
+}
 _ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 _SUMS = {"sum", "count_nonzero"}
 

@@ -120,7 +120,7 @@ def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
         (["export", "MAP", "out.ply", "--tile", "room"], "is a map file and has no tile", 1),
         (["export", "ATLAS", "out.ply", "--session", "0"], "not of an atlas", 2),
         (["view", "ATLAS", "--tile", "attic"], "has no tile 'attic'", 1),
-        (["follow", "ATLAS", "0", "--ros", "1"], "--ros publishes poses of one world", 2),
+        (["follow", "ATLAS", "0", "--ros"], "robots need poses of one world", 2),
     ],
 )
 def test_what_cannot_be_meant_is_said(
