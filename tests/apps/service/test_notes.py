@@ -41,7 +41,10 @@ def noted(folder: Path) -> Iterator[httpx.Client]:
 
 def test_a_note_is_kept_beside_the_map_until_it_is_deleted(noted: httpx.Client, folder: Path):
     before = (folder / "room.topo").read_bytes()
-    assert noted.get("/v1/maps/room/notes").json() == {"map": "room", "notes": []}
+    status = (folder / "room.topo").stat()
+    revision = f"{status.st_mtime_ns:x}-{status.st_size:x}"
+    none = {"map": "room", "revision": revision, "notes": []}
+    assert noted.get("/v1/maps/room/notes").json() == none
     answer = noted.post("/v1/maps/room/notes", json=NOTE | {"text": "  the switch\n"})
     assert answer.status_code == 201
     [note] = noted.get("/v1/maps/room/notes").json()["notes"]

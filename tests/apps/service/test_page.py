@@ -325,3 +325,28 @@ def test_the_scene_is_that_of_the_file_that_is_there_now(room_map: Path, lab: La
         )
         assert client.get("/v1/maps/a/scene").json()["map"]["id"] != before["map"]["id"]
         assert client.get("/v1/maps/b/scene").status_code == 404
+
+
+def test_a_map_that_grows_is_drawn_again_seen_as_before(browser: Any, lab: Lab):
+    """As `topoloc map` writes it: a file with more nodes in place of the one that is shown."""
+    growing = lab.map.with_name("growing.topo")
+    view = """() => { const { camera, controls } = document.getElementById("scene").viewer.stage;
+        return [...camera.position.toArray(), ...controls.target.toArray()]; }"""
+    nodes = "() => document.getElementById('scene').viewer?.document.nodes.length"
+    shutil.copy(lab.map, growing)
+    more = build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:14"), BuildConfig(other_kinds=()))
+    with opened(browser, f"{lab.service.url}/?map=growing", 1300) as page:
+        page.wait_for_selector("#scene canvas")
+        before = page.evaluate(nodes)
+        page.keyboard.press("Tab")
+        page.locator("#scene canvas").press("ArrowLeft")
+        seen_from = page.evaluate(view)
+        page.wait_for_timeout(3500)  # the page has asked once
+        more.save(growing)
+        for _ in range(200):
+            if page.evaluate(nodes) != before:
+                break
+            page.wait_for_timeout(100)
+        assert page.evaluate(nodes) == len(more.summaries)
+        np.testing.assert_allclose(page.evaluate(view), seen_from, atol=1e-4)
+    growing.unlink()

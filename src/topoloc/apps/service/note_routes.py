@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
@@ -51,9 +51,10 @@ class NoteFacts(NoteId):
 
 
 class NoteList(BaseModel):
-    """All notes of a map, the oldest first."""
+    """All notes of a map, the oldest first. `revision` differs once the file of the map does."""
 
     map: str
+    revision: str
     notes: list[NoteFacts]
 
 
@@ -65,8 +66,14 @@ class NoteList(BaseModel):
 async def list_notes(request: Request, map: MapName) -> NoteList:
     """Return the notes of a map."""
     service = get_service(request)
-    found = await _with_map(request, map, service.notes.list_notes)
-    return NoteList.model_validate({"map": map, "notes": found})
+
+    def read(path: Path, topomap: TopoMetricMap) -> dict[str, Any]:
+        status = path.stat()
+        revision = f"{status.st_mtime_ns:x}-{status.st_size:x}"
+        notes = service.notes.list_notes(path, topomap)
+        return {"map": map, "revision": revision, "notes": notes}
+
+    return NoteList.model_validate(await _with_map(request, map, read))
 
 
 @router.post(

@@ -60,6 +60,16 @@ export class Stage {
     this.lookAt(centre, from, distance);
   }
 
+  /** From where the scene is seen, for `goBack`. */
+  view() {
+    return [this.controls.target, this.camera.position].map((one) => one.clone());
+  }
+
+  goBack([target, position]) {
+    const from = position.clone().sub(target);
+    this.lookAt(target, from.clone().normalize(), from.length());
+  }
+
   lookAt(target, from, distance) {
     this.controls.target.copy(target);
     this.camera.position.copy(target).addScaledVector(from, distance);

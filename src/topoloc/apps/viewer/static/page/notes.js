@@ -5,7 +5,7 @@ import { saveText } from "topoloc/page/answers";
 const PERIOD_MS = 3000;
 
 export class Notes {
-  /** `told.changed(notes)` gets the notes of the map whenever they differ, `told.failed(error)` why one is not kept. */
+  /** `told.changed(notes)` gets the notes of the map whenever they differ, `told.grown()` that its file did, `told.failed(error)` why a note is not kept. */
   constructor(section, dialog, told) {
     Object.assign(this, { section, dialog, told, map: "", text: "[]", position: null, note: null });
     this.field = dialog.querySelector("textarea");
@@ -15,7 +15,7 @@ export class Notes {
 
   /** Show the notes of this map from now on. */
   follow(map) {
-    this.map = map;
+    [this.map, this.revision] = [map, ""];
     clearTimeout(this.timer);
     this.show([]);
     if (map) this.poll();
@@ -26,7 +26,11 @@ export class Notes {
     const { map } = this;
     const found = document.hidden ? null : await notesOf(map).catch(() => null); // the next one may come
     if (map !== this.map) return;
-    if (found) this.show(found.notes);
+    if (found) {
+      this.show(found.notes);
+      if (this.revision && this.revision !== found.revision) this.told.grown();
+      this.revision = found.revision;
+    }
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.poll(), PERIOD_MS);
   }

@@ -50,9 +50,7 @@ async function openMap() {
   try {
     const scene = await sceneOf(state.map);
     if (scene.name !== state.map) return;
-    state.viewer = new Viewer(part("scene"), scene);
-    state.mapId = scene.map.id;
-    live.setMap(state.viewer.points, scene.nodes, state.viewer.depth);
+    drawMap(scene);
     notes.follow(state.map);
     if (state.shown) state.viewer?.showLive(state.shown.result, drawnAs(state.shown));
     else if (!state.asked) showLinked();
@@ -61,6 +59,25 @@ async function openMap() {
     hint("The map is not shown.");
     tellFailure(error);
   }
+}
+
+function drawMap(scene) {
+  state.viewer = new Viewer(part("scene"), scene);
+  state.mapId = scene.map.id;
+  live.setMap(state.viewer.points, scene.nodes, state.viewer.depth);
+}
+
+/** Show a map that grew or was edited, seen as before. */
+async function redrawMap() {
+  const { map } = state;
+  const scene = await sceneOf(map).catch(() => null); // it is shown at its next change
+  if (!scene || state.map !== map || !state.viewer) return;
+  const view = state.viewer.stage?.view();
+  state.viewer.stage?.renderer.forceContextLoss();
+  drawMap(scene);
+  if (view) state.viewer.stage?.goBack(view);
+  state.viewer.showNotes(JSON.parse(notes.text));
+  if (state.shown) state.viewer.showLive(state.shown.result, { ...drawnAs(state.shown), follow: false });
 }
 
 function hint(text) {
@@ -244,6 +261,7 @@ const notes = new Notes(part("notes"), part("note"), {
     live.setNotes(all);
     state.viewer?.showNotes(all);
   },
+  grown: redrawMap,
   failed: (error) => (isLive() ? live.say(error.message, 4000, "bad") : tellFailure(error)),
 });
 
