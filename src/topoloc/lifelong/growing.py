@@ -66,7 +66,8 @@ class Growth(OneLine):
 
 
 class GrowingMap:
-    """A map file that grows by successive frames of a stereo or RGB-D recording.
+    """A map file that grows by successive frames of a stereo or RGB-D recording. `fault` is why the
+    last piece that could not be placed was not.
 
     Args:
         path: the new map file.
@@ -91,6 +92,7 @@ class GrowingMap:
         self._apart: list[_Piece] = []  # successive pieces that are not in the map
         self._world_from_cams: dict[int, Rigid3] = {}  # of the last piece, by frame
         self.max_shift_m = 0.0
+        self.fault = "no frames"
 
     def add(self, sequence: StereoSequence, stop: int | None = None) -> Growth:
         """Add the frames of the recording up to `stop` that were not given yet, and write the map.
@@ -132,8 +134,9 @@ class GrowingMap:
                 poses, shift = _numbered(posed.poses, piece.first), 0.0
             else:
                 poses, shift = self._extend(self._topomap, posed, piece)
-        except (RecordingError, TrajectoryError, EmptyMapError):
-            return None  # too dark, or nothing that the map knows
+        except (RecordingError, TrajectoryError, EmptyMapError) as error:
+            self.fault = str(error)  # too dark, or nothing that the map knows
+            return None
         self._world_from_cams = poses
         return sum(index >= piece.before for index in poses), shift
 

@@ -341,7 +341,7 @@ def test_after_a_kidnapping_it_moves_at_once_or_smoothly(make: Callable[..., Rob
 
 
 def test_without_odometry_each_measured_pose_is_that_of_the_camera(make: Callable[..., Robot]):
-    robot = make(odom_frame="none")
+    robot = make(odom_frame="none", confirm_images=1)
     robot.start_ns = 5_000_000_000  # of a recording
     robot.see(0)
     robot.see(1, state="predicted", result=NotLocalized("too_few_matches"))
@@ -353,6 +353,15 @@ def test_without_odometry_each_measured_pose_is_that_of_the_camera(make: Callabl
     for number in range(2, 9):
         robot.see(number)
     assert robot.warnings == []
+
+
+def test_without_odometry_a_jump_is_published_once_three_images_agree(make: Callable[..., Robot]):
+    robot, num_published = make(odom_frame="none"), list[int]()
+    away = Rigid3.exp(np.array([0.0, 20.0, 0.0, 0.0, 0.0, 0.0]))
+    for number, is_away in enumerate([False] * 4 + [True] + [False] + [True] * 3):
+        robot.see(number, **({"wrong": away} if is_away else {}))
+        num_published.append(len(robot.published.poses))
+    assert num_published == [0, 0, 1, 2, 2, 3, 3, 3, 4]
 
 
 def test_an_initial_pose_is_published_or_heard(make: Callable[..., Robot]):

@@ -125,6 +125,45 @@ class HealthGate:
         )
 
 
+class ContinuityGate:
+    """Decide which poses of a camera without odometry are published, by how fast it can move.
+
+    Args:
+        num_confirming: successive images that must agree on a first pose or a jump.
+    """
+
+    def __init__(self, num_confirming: int = 3) -> None:
+        self._num_confirming = num_confirming
+        self._agreed: tuple[int, Rigid3] | None = None
+        self._against: list[tuple[int, Rigid3]] = []
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Return whether the last images contradict the agreed pose."""
+        return bool(self._against)
+
+    def judge(self, t_ns: int, map_from_cam: Rigid3) -> Verdict:
+        """Take the pose of an image, see `HealthGate.judge`."""
+        measured = t_ns, map_from_cam
+        if self._agreed is not None and _can_follow(self._agreed, measured):
+            self._agreed, self._against = measured, []
+            return "found"
+        if self._against and not _can_follow(self._against[-1], measured):
+            self._against = []
+        self._against.append(measured)
+        if len(self._against) < self._num_confirming:
+            return "doubted"
+        self._agreed, self._against = measured, []
+        return "jumped"
+
+
+def _can_follow(before: tuple[int, Rigid3], after: tuple[int, Rigid3]) -> bool:
+    """Return whether a camera can have come from one pose to the other."""
+    least_m, speed, least_rad, turn = 0.3, 5.0, 0.3, 3.0  # metres per second, radians per second
+    seconds = max(after[0] - before[0], 0) / 1e9
+    return after[1].is_same(before[1], least_m + speed * seconds, least_rad + turn * seconds)
+
+
 class MapToOdom:
     """Hold the published transform, and the one that it moves to."""
 

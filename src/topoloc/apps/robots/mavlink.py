@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc import Localization, Rigid3, StreamedPose, TopolocError
+from topoloc.apps.robots.map_to_odom import ContinuityGate
 
 _ADDRESS = re.compile(r"udp(in|out):(\[[^\]]+\]|[^:\[\]]+):([0-9]{1,5})")
 
@@ -144,8 +145,7 @@ class DroneLocalizer:
     def __init__(self, address: str, warn: Callable[[str], None]) -> None:
         self._publisher, self._warn = MavlinkPublisher(address), warn
         self._last: Localization | None = None  # as sent
-        self._last_ns, self._received = 0, 0.0
-        self._doubted: list[tuple[int, Rigid3]] = []  # successive poses that do not continue it
+        self._last_ns, self._received, self._gate = 0, 0.0, ContinuityGate()
         self._lock, self._is_closed = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._repeat, name="mavlink", daemon=True)
         self._thread.start()
@@ -159,27 +159,18 @@ class DroneLocalizer:
     def take(self, answer: StreamedPose) -> None:
         """Take the answer for an image. It is sent if it is measured, probable, and continues the
         last pose or is confirmed."""
-        min_probability, num_confirming = 0.8, 3
-        result = answer.result
+        min_probability, result = 0.8, answer.result
         if not isinstance(result, Localization) or answer.is_repeated:
             return
         if result.probability < min_probability:
             return
-        pose, last = result.world_from_cam, self._last
-        is_next = last is not None and _continues(
-            self._last_ns, last.world_from_cam, answer.t_ns, pose
-        )
-        if not is_next:
-            if self._doubted and not _continues(*self._doubted[-1], answer.t_ns, pose):
-                self._doubted = []
-            self._doubted.append((answer.t_ns, pose))
-            if len(self._doubted) < num_confirming:
-                return
-        is_reset = not is_next and last is not None
+        verdict, is_first = self._gate.judge(answer.t_ns, result.world_from_cam), self._last is None
+        if verdict == "doubted":
+            return
         with self._lock:
-            self._doubted, self._last, self._last_ns = [], result, answer.t_ns
+            self._last, self._last_ns = result, answer.t_ns
             self._received = time.monotonic()
-            self._send(is_reset)
+            self._send(is_reset=verdict == "jumped" and not is_first)
 
     def _send(self, is_reset: bool) -> None:
         if self._last is None:
@@ -199,10 +190,3 @@ class DroneLocalizer:
             with self._lock:
                 if self._last is not None and time.monotonic() - self._received < max_age:
                     self._send(is_reset=False)
-
-
-def _continues(before_ns: int, before: Rigid3, t_ns: int, pose: Rigid3) -> bool:
-    """Return whether a drone can have come from one pose to the other."""
-    least_m, speed, least_rad, turn = 0.3, 5.0, 0.3, 3.0  # metres per second, radians per second
-    seconds = max(t_ns - before_ns, 0) / 1e9
-    return pose.is_same(before, least_m + speed * seconds, least_rad + turn * seconds)

@@ -1,5 +1,5 @@
 """The time of the robot (this machine's, that of /clock, or that of another machine's stamps), and
-what /diagnostics says about the localization: level, one sentence, and figures."""
+the content of /diagnostics: level, one sentence, and figures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from topoloc.apps.robots.config import RobotConfig
 
 
 class RobotClock:
-    """Tell the time of the stamps.
+    """Hold the time of the stamps.
 
     Args:
         is_simulated: the time is that of `set_simulated`.

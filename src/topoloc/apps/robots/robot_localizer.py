@@ -20,6 +20,7 @@ from topoloc.apps.formats.bags.messages import frame_id, stamp_ns, stamped_trans
 from topoloc.apps.query_camera import CameraOfSize
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.map_to_odom import (
+    ContinuityGate,
     Evidence,
     HealthGate,
     MapToOdom,
@@ -64,6 +65,7 @@ class RobotLocalizer:
         self._map_from_world = map_from_world or Rigid3.identity()
         self._clock = RobotClock(config.use_sim_time, config.clock_offset)
         self._transforms, self._gate = TransformBuffer(), HealthGate(config)
+        self._camera_gate = ContinuityGate(config.confirm_images)  # without odometry
         self._map_to_odom, self._health = MapToOdom(config), Health()
         self._odometry: Odometry | None = None  # of the last image that had one
         self._user_pose: Any = None
@@ -141,6 +143,7 @@ class RobotLocalizer:
         """Start again, because the clock was set back."""
         with self._lock:
             self._gate.reset()
+            self._camera_gate = ContinuityGate(self._config.confirm_images)
             self._map_to_odom.reset()
             self._transforms.forget_after(t_ns)
             self._clock.reset()
@@ -200,11 +203,13 @@ class RobotLocalizer:
         health.num_dropped = 0 if self._images is None else self._images.num_dropped
         if pose is not None and health.probability >= self._config.min_probability:
             if not self._config.has_odometry:
-                self._publish_camera(answer.t_ns, *pose)
+                if self._camera_gate.judge(answer.t_ns, pose[0]) != "doubted":
+                    self._publish_camera(answer.t_ns, *pose)
             elif odometry is not None:
                 is_localized = answer.state == "localized"
                 self._judge(_make_evidence(answer.t_ns, pose, odometry, is_localized), odometry)
-        health.is_contradicted = self._gate.is_contradicted
+        gate = self._gate if self._config.has_odometry else self._camera_gate
+        health.is_contradicted = gate.is_contradicted
         health.latency_ms = (self._clock.now_ns() - answer.t_ns) / 1e6
         health.answer_at = time.monotonic()
 

@@ -1,5 +1,5 @@
-"""Requests from pages of other sites (CORS): the origins that may ask, and the headers that tell
-their browsers so."""
+"""Requests from pages of other sites (CORS): the allowed origins, and the response headers that
+browsers check."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ def parse_origin(text: str) -> str:
 
 
 class CrossOrigin:
-    """Decides which origins may ask, and writes the headers of their responses."""
+    """Holds the allowed origins. Returns the headers of responses."""
 
     def __init__(self, origins: Collection[str]) -> None:
         self._origins = frozenset(origins)
 
     def allows(self, origin: str, host: str) -> bool:
-        """Whether a page of this origin may ask the service under this host name. Programs send no
-        origin."""
+        """Return whether requests from pages of this origin are allowed under this host name.
+        Programs send no origin."""
         return not origin or _is_own(origin, host) or self._is_listed(origin)
 
     def response_headers(self, origin: str) -> dict[str, str]:
-        """Headers of every response, refusals too. Without them a browser hides it from the
-        page."""
+        """Return the headers of every response, also of a refusal. Without them a browser hides it
+        from the page."""
         if not self._origins:
             return {}
         if not self._is_listed(origin):
@@ -54,10 +54,10 @@ class CrossOrigin:
         }
 
     def preflight_headers(self, is_private_network: bool) -> dict[str, str]:
-        """Headers of the response to a preflight. Some browsers ask whether a page of the internet
-        may reach this network."""
-        asked = {"access-control-allow-private-network": "true"} if is_private_network else {}
-        return _PREFLIGHT | asked
+        """Return the headers of the response to a preflight. `is_private_network`: the browser
+        checks access from the internet to this network, too."""
+        private = {"access-control-allow-private-network": "true"} if is_private_network else {}
+        return _PREFLIGHT | private
 
     def _is_listed(self, origin: str) -> bool:
         listed = origin.lower() in self._origins or ANY_ORIGIN in self._origins

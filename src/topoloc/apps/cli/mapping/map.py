@@ -89,10 +89,7 @@ class Command:
                     )
         topomap = growing.finish()
         if topomap is None:
-            raise RecordingError(
-                f"{self.source}: no piece of it could be mapped: too dark, without texture, or no"
-                " stereo"
-            )
+            raise RecordingError(f"{self.source}: no piece of it could be mapped: {growing.fault}")
         facts = topomap.describe(self.map) | {
             "num_frames": num_frames,
             "num_lost": num_lost,
@@ -106,9 +103,9 @@ class Command:
                 f" mapped, pieces moved by at most {growing.max_shift_m:.3f} m"
             )
         growing.close()
+        write_json(self.json, facts)
         if self.level:
             find_and_move(self.map)
-        write_json(self.json, facts)
         return 0
 
     def _pieces(self, stop: threading.Event) -> Iterator[tuple[StereoSequence, int]]:
