@@ -50,12 +50,12 @@ def propose_first(search: Search, prior: Rigid3 | None) -> NodeProposal:
     """
     least = float(search.config.num_chance_inliers)
     if prior is None:
-        proposal = _propose_from_nodes(search, "retrieval", _rank_nodes(search), least)
+        proposal = propose_from_nodes(search, "retrieval", _rank_nodes(search), least)
     else:
         distances = search.map.distances(prior)
         rows = search.map.nearest(prior, search.config.num_candidates)
         search.ranked = [NodeScore(row, -float(distances[row])) for row in rows]  # by Eq. 1
-        proposal = _propose_from_nodes(search, "prior", rows, least)
+        proposal = propose_from_nodes(search, "prior", rows, least)
     search.num_retrieved = proposal.fit.num_inliers
     return proposal
 
@@ -84,7 +84,7 @@ def _rank_nodes(search: Search) -> list[Row]:
     return [candidate.row for candidate in search.candidates]
 
 
-def _propose_from_nodes(
+def propose_from_nodes(
     search: Search, source: Source, rows: list[Row], least: float
 ) -> NodeProposal:
     """Propose a pose from the pooled points of these nodes.
@@ -160,7 +160,7 @@ def propose_similar_places(search: Search) -> Iterator[NodeProposal]:
         group, left = [row for row in left if near[row]], [row for row in left if not near[row]]
         if set(group) != queried:
             num_groups, least = num_groups + 1, min_rival_inliers(search)
-            proposal = _propose_from_nodes(
+            proposal = propose_from_nodes(
                 search, "look-alikes", group[: search.config.num_candidates], least
             )
             if proposal.fit.num_inliers >= least:
@@ -242,7 +242,7 @@ def propose_from_other_features(search: Search) -> Iterator[NodeProposal]:
         return
     for hypothesis in previous.belief.ranked(previous.weights.rivals)[:3]:
         fit, least = hypothesis.fit, float(config.evidence.min_found)
-        yield from _propose_around(search, "other features", fit.world_from_cam, fit.camera, least)
+        yield from propose_around(search, "other features", fit.world_from_cam, fit.camera, least)
 
 
 def propose_repetitions(search: Search) -> Iterator[NodeProposal]:
@@ -267,13 +267,13 @@ def propose_repetitions(search: Search) -> Iterator[NodeProposal]:
             tried.append(world_from_cam)
             least = 0.2 * hypothesis.evidence.num_found  # far fewer points refute a repetition
             previous, camera = search.belief.hypotheses, hypothesis.fit.camera
-            yield from _propose_around(
+            yield from propose_around(
                 search, "repetition", world_from_cam, camera, least, hypothesis.evidence
             )
             waiting += [other for other in search.belief.hypotheses if other not in previous]
 
 
-def _propose_around(
+def propose_around(
     search: Search,
     source: Source,
     world_from_cam: Rigid3,

@@ -58,6 +58,7 @@ from topoloc.localization.tiles.tiles import (
     merge_tile_results,
     ranking_margin,
 )
+from topoloc.localization.votes import propose_voted_places
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 
 TileProposals = Generator[Proposal, None, ResultWithInliers]
@@ -74,6 +75,8 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
 
 def propose_more(search: Search) -> Iterator[Proposal]:
     """Generate the proposals of one feature type that follow retrieval."""
+    if not search.is_clear:
+        yield from propose_voted_places(search)
     viewpoints = [] if search.is_clear else list(propose_node_viewpoints(search))
     yield from viewpoints
     is_recognised = viewpoints or search.num_retrieved >= search.config.num_chance_inliers

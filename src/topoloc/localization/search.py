@@ -63,7 +63,7 @@ class Trace(OneLine):
 
 
 Source = Literal[
-    "prior", "retrieval", "other features", "look-alikes", "viewpoints", "repetition", "walls"
+    "prior", "retrieval", "votes", "other features", "look-alikes", "viewpoints", "repetition", "walls"
 ]
 
 
