@@ -9,10 +9,9 @@ sees them without slant, and alike from both directions.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,53 +70,34 @@ class VirtualView:
         return replace(features, points_img=camera.img_from_cam(rays).astype(np.float32))
 
 
-Turn = Literal["ahead", "left", "right"]
-"""Where a camera looks, against the path beside its walls: along it, or half aside."""
-
-
-@lru_cache(maxsize=24)
-def make_virtual_views(
-    camera: Camera, turn: Turn = "ahead", max_nearest: float = 1.5
-) -> tuple[VirtualView, ...]:
-    """Return the virtual views that face the walls beside the path, left and right.
-
-    A camera that looks along the path sees both walls, one that is turned by 45 degrees only that
-    on its side. Views for which the field of view is too narrow are left out: they begin beyond
-    `max_nearest`, a tangent off the virtual camera's axis.
-    """
-    ahead, half = math.radians(90.0), math.radians(45.0)
-    sides = {
-        "ahead": (("left", -1.0, ahead), ("right", 1.0, ahead)),
-        "left": (("half left", -1.0, half),),
-        "right": (("half right", 1.0, half),),
-    }
-    views = (_make_virtual_view(camera, *side, max_nearest) for side in sides[turn])
+@lru_cache(maxsize=8)
+def make_virtual_views(camera: Camera, max_nearest: float = 1.5) -> tuple[VirtualView, ...]:
+    """Return the virtual views to the left and to the right, without those for which the field of
+    view is too narrow: it begins beyond `max_nearest`, a tangent off the virtual camera's axis."""
+    sides = (("left", -1.0), ("right", 1.0))
+    views = (_make_virtual_view(camera, name, sign, max_nearest) for name, sign in sides)
     return tuple(view for view in views if view is not None)
 
 
 def _make_virtual_view(
-    camera: Camera, name: str, sign: float, angle: float, max_nearest: float
+    camera: Camera, name: str, sign: float, max_nearest: float
 ) -> VirtualView | None:
-    """Return one virtual view, or None. Its axis is `angle` (radians) off the camera's, to the side
-    that `sign` names, that of x in the camera's frame. The virtual camera's x axis points ahead on
-    the left and back on the right."""
+    """Return one virtual view, or None. `sign` is that of x in the camera's frame. The virtual
+    camera's x axis points ahead on the left and back on the right."""
     farthest = 3.0  # largest tangent ahead. Walls farther ahead are too slanted to be seen well
     half_height = 0.9  # largest tangent up and down
     max_side_px = 700  # maximum length of the longer side of a virtual view
     margin_px = 8  # features nearer than this to the border of the rendered area are dropped
-    cos, sin = round(math.cos(angle), 12), math.sin(angle)
     cam_from_virtual = Rigid3(
-        np.array([[cos, 0.0, sign * sin], [0.0, 1.0, 0.0], [-sign * sin, 0.0, cos]]), np.zeros(3)
+        np.array([[0.0, 0.0, sign], [0.0, 1.0, 0.0], [-sign, 0.0, 0.0]]), np.zeros(3)
     )
     # The largest tangent to the side in the field of view. Rays behind the camera, at the ends of
     # its rows, have no tangent and are ignored.
     row = np.column_stack([np.arange(camera.width), np.full(camera.width, camera.cy)])
     tangent = float(np.nanmax(sign * camera.normalized_from_img(row)[:, 0]))
-    # tangent of the angle between the virtual camera's axis and the border of the field of view
-    nearest = (sin - cos * tangent) / (cos + sin * tangent)
-    if nearest > max_nearest:
+    if tangent * max_nearest < 1.0:
         return None
-    focal = camera.fx
+    nearest, focal = 1.0 / tangent, camera.fx
     extent = np.array([farthest - nearest, 2.0 * half_height])
     focal *= min(1.0, max_side_px / (focal * extent.max()))
     width, height = np.maximum(np.rint(focal * extent), 1).astype(int)
@@ -127,9 +107,8 @@ def _make_virtual_view(
     virtual = Camera.pinhole(int(width), int(height), focal, focal, cx, focal * half_height)
     shape = virtual.height, virtual.width
     rays = virtual.rays_from_img(np.indices(shape, np.float64)[::-1].reshape(2, -1).T)
-    # column by column, as a product of matrices would wait for BLAS's threads
-    x, y, z = rays.T
-    rays_cam = np.column_stack([cos * x + sign * sin * z, y, cos * z - sign * sin * x])
+    # the rotation permutes the axes; a product of matrices would wait for BLAS's threads
+    rays_cam = np.column_stack([sign * rays[:, 2], rays[:, 1], -sign * rays[:, 0]])
     points_img = camera.img_from_cam(rays_cam).reshape(*shape, 2)
     reach = np.isfinite(points_img).all(axis=2) & (points_img >= 0).all(axis=2)
     reach &= (points_img <= [camera.width - 1, camera.height - 1]).all(axis=2)

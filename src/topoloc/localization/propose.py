@@ -242,7 +242,7 @@ def propose_from_other_features(search: Search) -> Iterator[NodeProposal]:
         return
     for hypothesis in previous.belief.ranked(previous.weights.rivals)[:3]:
         fit, least = hypothesis.fit, float(config.evidence.min_found)
-        yield from propose_around(search, "other features", fit.world_from_cam, fit.camera, least)
+        yield from _propose_around(search, "other features", fit.world_from_cam, fit.camera, least)
 
 
 def propose_repetitions(search: Search) -> Iterator[NodeProposal]:
@@ -267,13 +267,13 @@ def propose_repetitions(search: Search) -> Iterator[NodeProposal]:
             tried.append(world_from_cam)
             least = 0.2 * hypothesis.evidence.num_found  # far fewer points refute a repetition
             previous, camera = search.belief.hypotheses, hypothesis.fit.camera
-            yield from propose_around(
+            yield from _propose_around(
                 search, "repetition", world_from_cam, camera, least, hypothesis.evidence
             )
             waiting += [other for other in search.belief.hypotheses if other not in previous]
 
 
-def propose_around(
+def _propose_around(
     search: Search,
     source: Source,
     world_from_cam: Rigid3,

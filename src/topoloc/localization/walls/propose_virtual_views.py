@@ -15,13 +15,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import get_args
 
 import numpy as np
 
 from topoloc.features.config import MatchingConfig
 from topoloc.features.matching import match_features
-from topoloc.features.virtual_views import Turn
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
@@ -29,7 +27,6 @@ from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import measure_evidence
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
-from topoloc.localization.propose import propose_around
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.place_comparison import Comparison
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
@@ -77,6 +74,7 @@ class VirtualViewProposal(Proposal):
 def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     """Generate the proposals with the most agreeing matches."""
     clear_log_odds = 2.5  # virtual views are skipped if a pose of the nodes has higher log-odds
+    max_hypotheses = 6  # maximum number of pose proposals that are refined
     config, best = search.config.walls, search.best
     is_explained_by_nodes = (
         best is not None
@@ -91,17 +89,10 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
         or (index := search.map.walls) is None
     ):
         return
-    for turn in get_args(Turn):
-        yield from _propose_turned(search, index, turn)
-
-
-def _propose_turned(search: Search, index: VirtualViewIndex, turn: Turn) -> Iterator[Proposal]:
-    """Generate the proposals of a camera that looks this way, most agreeing matches first."""
-    max_hypotheses = 6  # maximum number of pose proposals that are refined
     with search.query.clock.stage("walls"):
-        if not _may_show_place(search, index, turn):
+        if not _may_show_place(search, index):
             return
-        walls = VirtualViewSearch.of(search, index, turn)
+        walls = VirtualViewSearch.of(search, index)
         compared = [Comparison.of(walls, place) for place in walls.places]
         compared.sort(key=lambda one: -one.num_strong)
     tried = list[VirtualViewProposal]()
@@ -112,24 +103,16 @@ def _propose_turned(search: Search, index: VirtualViewIndex, turn: Turn) -> Iter
             proposal = _look_closer(one, tried)
         if proposal is not None:
             tried.append(proposal)
-            before = search.belief.hypotheses
             yield proposal
-            if turn == "ahead":
-                continue
-            for new in search.belief.hypotheses:
-                if new not in before and not new.evidence.is_of_nodes:
-                    yield from propose_around(
-                        search, "walls", new.world_from_cam, new.fit.camera, 20.0
-                    )
 
 
-def _may_show_place(search: Search, index: VirtualViewIndex, turn: Turn) -> bool:
+def _may_show_place(search: Search, index: VirtualViewIndex) -> bool:
     """Return whether the nearest parts of the walls alone agree with a candidate place. They take
     half as long to extract, and a right place shows itself in them."""
     stop = search.weights.walls.stop
     if stop.near_tangent <= 0.0:
         return True
-    near = VirtualViewSearch.of(search, index, turn, stop.near_tangent)
+    near = VirtualViewSearch.of(search, index, stop.near_tangent)
     return any(Comparison.of(near, place).num_strong >= stop.min_strong for place in near.places)
 
 
@@ -228,7 +211,7 @@ def _score(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis:
         num_inliers=proposal.num_agreeing,
         num_by_chance=counts.num_by_chance,
         num_distinct=_num_distinct(walls, final),
-        num_lesser_side=min(num_left, num - num_left) if len(walls.seen) > 1 else 0,
+        num_lesser_side=min(num_left, num - num_left),
     )
     log_odds = search.weights.log_odds(evidence)
     noise_share = final.pose.noise_share(inflated)

@@ -98,21 +98,19 @@ class CandidatePlaces:
     def of(
         view: VirtualView, index: VirtualViewIndex, likeness: Float32[np.ndarray, " sides"]
     ) -> CandidatePlaces:
-        """Return the places of all virtual views of one side.
+        """Return the places of all virtual views of the opposite side.
 
-        A camera that comes back sees those of the opposite side, as far ahead as the mapping camera
-        did. A camera that looks half aside sees those of the same side, in the middle of its image.
+        Those of the same side belong to the mapped direction.
 
         Args:
             likeness: similarity of each virtual view of the map to the view.
         """
-        # a left camera's x axis points ahead, a right one's back
-        rotation = view.cam_from_virtual.rotation
-        ahead, looks_along = -np.sign(rotation[0, 2]), abs(rotation[0, 0]) < 0.1
-        along, depths = index.middles[:, 0], index.middles[:, 2]
-        rows = np.flatnonzero(ahead * along * (-1.0 if looks_along else 1.0) > 0.0)
-        moves = 2.0 * along if looks_along else along - ahead * depths
-        centres = index.positions[rows] + moves[rows, None] * index.rotations[rows, :, 0]
+        ahead = -view.cam_from_virtual.rotation[
+            0, 2
+        ]  # a left camera's x axis points ahead, a right one's back
+        along = index.middles[:, 0]
+        rows = np.flatnonzero(ahead * along < 0.0)
+        centres = index.positions[rows] + 2.0 * along[rows, None] * index.rotations[rows, :, 0]
         return CandidatePlaces(
             index.rotations[rows] @ view.cam_from_virtual.rotation.T, centres, likeness[rows]
         )

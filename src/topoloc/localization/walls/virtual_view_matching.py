@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from topoloc.features.extraction import extract_from_normalized, normalize_image
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features, Matches
-from topoloc.features.virtual_views import Turn, VirtualView, make_virtual_views
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import sample_rows
@@ -187,16 +187,16 @@ class VirtualViewSearch:
 
     @staticmethod
     def of(
-        search: Search, index: VirtualViewIndex, turn: Turn, max_tangent: float = math.inf
+        search: Search, index: VirtualViewIndex, max_tangent: float = math.inf
     ) -> VirtualViewSearch:
-        """Extract the side views of the query image and select the candidate places.
+        """Extract both side views of the query image and select the candidate places.
 
         Walls beyond `max_tangent` ahead, a tangent off the view's axis, are left out.
         """
         num_d_thresh = 2.0  # minimum distance between these places, in D_thresh
         query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
         assert isinstance(query.input_camera, Camera)
-        for view in make_virtual_views(query.input_camera, turn):
+        for view in make_virtual_views(query.input_camera):
             picture = view.picture(query.grey)
             extract = partial(
                 _extract_view_features, index.feature_config, view, picture, max_tangent
