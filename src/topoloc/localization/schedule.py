@@ -80,7 +80,7 @@ def propose_more(search: Search) -> Iterator[Proposal]:
     viewpoints = [] if search.is_clear else list(propose_node_viewpoints(search))
     yield from viewpoints
     is_recognised = viewpoints or search.num_retrieved >= search.config.num_chance_inliers
-    if search.is_clear or is_recognised:
+    if search.is_clear:
         yield from propose_similar_places(search)
     yield from propose_repetitions(search)
     yield from propose_virtual_views(search)

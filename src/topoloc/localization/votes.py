@@ -24,8 +24,6 @@ def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
     max_places = 4
     least = float(search.config.num_chance_inliers)
     for rows in list(_places(search, max_places)):
-        if search.is_clear:
-            return
         proposal = propose_from_nodes(search, "votes", rows, least)
         if proposal.fit.num_inliers >= least:
             yield proposal
