@@ -39,9 +39,10 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     A pose with more than `clear_log_odds` is clear. Only very similar places of the map are then
     searched. A pose with less than `hopeless_log_odds` cannot become probable by more matches.
 
-    A pose whose points lie in less than `narrow_spread` of the image has at most
-    `max_narrow_log_odds`, because one of several equal doors explains that (fitted to the corridor
-    of seed 5, walked back; 194 right poses of other recordings have 0.29 and more).
+    A pose whose points lie in less than `narrow_spread` of the image may show one of several equal
+    doors, which fits less precisely. It has at most the log-odds `max_narrow_log_odds` at a doubt
+    of 0.1, and `narrow_doubt` more for each e-fold of it. These numbers were fitted to images that
+    look aside or back in corridors of seeds 2 and 3 (docs/journal/localization.md).
     """
 
     even_share: Finite
@@ -53,8 +54,9 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     bias: Finite
     clear_log_odds: Finite
     hopeless_log_odds: Finite = -3.0
-    narrow_spread: Finite = 0.25
-    max_narrow_log_odds: Finite = 2.0
+    narrow_spread: Finite = 0.32
+    max_narrow_log_odds: Finite = 2.2
+    narrow_doubt: Finite = -1.4
     few_points: ClassVar[float] = 0.0
     """The covariance of few points is not inflated."""
 
@@ -166,7 +168,8 @@ def compute_log_odds(evidence: Evidence, weights: EvidenceWeights | VirtualViewW
     features = weights.features(evidence)
     log_odds = sum(w * x for w, x in zip(weights.as_vector, features, strict=True)) + weights.bias
     if isinstance(weights, EvidenceWeights) and evidence.spread < weights.narrow_spread:
-        return min(log_odds, weights.max_narrow_log_odds)
+        by_doubt = weights.narrow_doubt * (log_doubt(evidence) - math.log(0.1))
+        return min(log_odds, weights.max_narrow_log_odds + by_doubt)
     return log_odds
 
 

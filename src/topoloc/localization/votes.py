@@ -31,6 +31,7 @@ def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
 
 def _places(search: Search, max_places: int) -> Iterator[list[Row]]:
     """Generate the places with the most votes: the rows of nodes whose points are pooled."""
+    min_share = 0.3  # minimum votes of a place, as a share of the most
     num_d_thresh = 3.0  # nodes within this many D_thresh (Eq. 1) show one place
     with search.query.clock.stage("coarse"):
         rows = _searched_rows(search)
@@ -44,9 +45,10 @@ def _places(search: Search, max_places: int) -> Iterator[list[Row]]:
         margins = np.maximum(best.max(axis=1) - elsewhere, 0.0)
         votes = (here >= best.max(axis=1, keepdims=True)) * margins[:, None]
         of_places, of_nodes = votes.sum(axis=0), ((best >= here - 0.02) * margins[:, None]).sum(axis=0)
+    least = min_share * of_places.max()
     for _ in range(max_places):
         leader = int(np.argmax(of_places))
-        if of_places[leader] <= 0.0:
+        if of_places[leader] < least or least == 0.0:
             return
         near = np.flatnonzero(apart[leader] <= reach)
         order = near[np.argsort(-of_nodes[near], kind="stable")]
