@@ -50,12 +50,12 @@ def propose_first(search: Search, prior: Rigid3 | None) -> NodeProposal:
     """
     least = float(search.config.num_chance_inliers)
     if prior is None:
-        proposal = propose_from_nodes(search, "retrieval", _rank_nodes(search), least)
+        proposal = _propose_from_nodes(search, "retrieval", _rank_nodes(search), least)
     else:
         distances = search.map.distances(prior)
         rows = search.map.nearest(prior, search.config.num_candidates)
         search.ranked = [NodeScore(row, -float(distances[row])) for row in rows]  # by Eq. 1
-        proposal = propose_from_nodes(search, "prior", rows, least)
+        proposal = _propose_from_nodes(search, "prior", rows, least)
     search.num_retrieved = proposal.fit.num_inliers
     return proposal
 
@@ -65,10 +65,10 @@ def propose_quick(search: Search, least: float) -> NodeProposal | None:
 
     None if fewer than `least` of them agree.
     """
-    quick_proposal = _match_and_fit(
+    quick_proposal = match_and_fit(
         search,
         "retrieval",
-        _create_matcher(search, _rank_nodes(search)),
+        create_matcher(search, _rank_nodes(search)),
         least,
         search.config.num_first_features,
     )
@@ -84,7 +84,7 @@ def _rank_nodes(search: Search) -> list[Row]:
     return [candidate.row for candidate in search.candidates]
 
 
-def propose_from_nodes(
+def _propose_from_nodes(
     search: Search, source: Source, rows: list[Row], least: float
 ) -> NodeProposal:
     """Propose a pose from the pooled points of these nodes.
@@ -92,15 +92,15 @@ def propose_from_nodes(
     The strongest features are matched first. All are matched if at least `least` of these agree but
     the pose is not clear.
     """
-    config, matcher = search.config, _create_matcher(search, rows)
-    proposal = _match_and_fit(search, source, matcher, least, config.num_first_features)
+    config, matcher = search.config, create_matcher(search, rows)
+    proposal = match_and_fit(search, source, matcher, least, config.num_first_features)
     is_open = least <= proposal.fit.num_inliers < config.num_clear_inliers
     if is_open and len(search.query.features) > config.num_first_features:
-        proposal = _match_and_fit(search, source, matcher, least)
+        proposal = match_and_fit(search, source, matcher, least)
     return proposal
 
 
-def _create_matcher(search: Search, rows: list[Row]) -> tuple[LocalMap, Matcher]:
+def create_matcher(search: Search, rows: list[Row]) -> tuple[LocalMap, Matcher]:
     """Return the points of these nodes and a matcher of the query's features with them."""
     points = search.map.local_map(rows)
     return points, Matcher(
@@ -111,7 +111,7 @@ def _create_matcher(search: Search, rows: list[Row]) -> tuple[LocalMap, Matcher]
     )
 
 
-def _match_and_fit(
+def match_and_fit(
     search: Search,
     source: Source,
     points_and_matcher: tuple[LocalMap, Matcher],
@@ -160,7 +160,7 @@ def propose_similar_places(search: Search) -> Iterator[NodeProposal]:
         group, left = [row for row in left if near[row]], [row for row in left if not near[row]]
         if set(group) != queried:
             num_groups, least = num_groups + 1, min_rival_inliers(search)
-            proposal = propose_from_nodes(
+            proposal = _propose_from_nodes(
                 search, "look-alikes", group[: search.config.num_candidates], least
             )
             if proposal.fit.num_inliers >= least:

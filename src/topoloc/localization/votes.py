@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float32
 
-from topoloc.localization.propose import propose_from_nodes
+from topoloc.localization.propose import create_matcher, match_and_fit
 from topoloc.localization.refine import NodeProposal
 from topoloc.localization.search import Search
 from topoloc.node_ids import Row
@@ -24,7 +24,8 @@ def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
     max_places = 4
     least = float(search.config.num_chance_inliers)
     for rows in list(_places(search, max_places)):
-        proposal = propose_from_nodes(search, "votes", rows, least)
+        matcher = create_matcher(search, rows)
+        proposal = match_and_fit(search, "votes", matcher, least, search.config.num_first_features)
         if proposal.fit.num_inliers >= least:
             yield proposal
 
@@ -68,7 +69,7 @@ def _searched_rows(search: Search) -> list[Row]:
 
 def _best_similarities(search: Search, rows: list[Row]) -> Float32[np.ndarray, "features nodes"]:
     """Return the largest similarity of each of the strongest features to a point of each node."""
-    num_features = 160
+    num_features = 96
     parts = [search.map.local_map([row]).descriptors for row in rows]
     firsts = np.cumsum([0, *(len(part) for part in parts[:-1])])
     found = search.query.features.descriptors[:num_features] @ np.concatenate(parts).T
