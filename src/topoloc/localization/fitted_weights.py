@@ -190,12 +190,14 @@ class NodeStop(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold when the nodes of a map are given up (`schedule.py`).
 
     If the retrieved nodes give fewer than `min_inliers` inliers, a right pose would have shown
-    itself, and only virtual views are compared. Without `continues_earlier`, feature types that
+    itself, and only virtual views are compared. No place with fewer than `min_votes` (`votes.py`)
+    is compared. Without `continues_earlier`, feature types that
     precede this one are not continued if it finds no pose. The defaults never give up. `corpus` is
     what they were fitted to.
     """
 
     min_inliers: int = 0
+    min_votes: Finite = 0.0
     continues_earlier: bool = True
     corpus: str = ""
     date: str = ""
