@@ -133,20 +133,18 @@ def match_and_fit(
 
 
 def propose_similar_places(search: Search) -> Iterator[NodeProposal]:
-    """Propose poses in similar places, far from the best pose.
+    """Propose poses in similar places, far from the best pose, which is clear.
 
     They are groups of nodes with nearly the best coarse score.
     """
-    # Minimum score of a similar place, as a share of the best score: if the pose is clear,
-    # and if it is not.
-    min_score_share = (0.85, 0.4)
+    min_score_share = 0.85  # minimum score of a similar place, as a share of the best score
     # Nodes within this many D_thresh of a pose (Eq. 1) belong to its place. Similar places
     # are farther away.
     num_d_thresh = 5.0
     config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
     if not search.ranked or not config.max_groups or search.is_hopeless:
         return
-    least = min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
+    least = min_score_share * search.ranked[0].score
     left = [candidate.row for candidate in search.ranked if candidate.score >= least]
     queried = {candidate.row for candidate in search.candidates}
     reach = num_d_thresh * search.map.d_thresh

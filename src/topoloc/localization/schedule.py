@@ -75,11 +75,9 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
 
 def propose_more(search: Search) -> Iterator[Proposal]:
     """Generate the proposals of one feature type that follow retrieval."""
-    if not search.is_clear:
-        yield from propose_voted_places(search)
-    viewpoints = [] if search.is_clear else list(propose_node_viewpoints(search))
-    yield from viewpoints
-    is_recognised = viewpoints or search.num_retrieved >= search.config.num_chance_inliers
+    for propose_unclear in (propose_voted_places, propose_node_viewpoints):
+        if not search.is_clear:
+            yield from propose_unclear(search)
     if search.is_clear:
         yield from propose_similar_places(search)
     yield from propose_repetitions(search)

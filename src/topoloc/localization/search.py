@@ -63,7 +63,14 @@ class Trace(OneLine):
 
 
 Source = Literal[
-    "prior", "retrieval", "votes", "other features", "look-alikes", "viewpoints", "repetition", "walls"
+    "prior",
+    "retrieval",
+    "votes",
+    "other features",
+    "look-alikes",
+    "viewpoints",
+    "repetition",
+    "walls",
 ]
 
 

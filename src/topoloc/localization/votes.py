@@ -22,7 +22,7 @@ from topoloc.node_ids import Row
 def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
     """Propose a pose in each place with many votes, most votes first."""
     with search.query.clock.stage("coarse"):
-        places = list(_find_places(search))
+        places = list(find_places(search))
     least, config = float(search.config.num_chance_inliers), search.config
     for rows in places:
         matcher = create_matcher(search, rows)
@@ -31,32 +31,46 @@ def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
             yield proposal
 
 
-def _find_places(search: Search) -> Iterator[list[Row]]:
+def find_places(search: Search) -> Iterator[list[Row]]:
     """Generate the nodes of each place that are pooled. There are none if chance explains the
     votes."""
-    max_nodes = 128  # of a larger map, the nodes that rank first
     max_places, min_share = 4, 0.3  # minimum votes of a place, as a share of the most
+    rows, apart, of_places, of_nodes = count_votes(search)
+    least = max(min_share * of_places.max(initial=0.0), search.weights.stop.min_votes)
+    for _ in range(max_places):
+        if of_places.max(initial=0.0) < least or least == 0.0:
+            return
+        here = apart[int(np.argmax(of_places))] <= 1.0
+        order = np.argsort(-np.where(here, of_nodes, -1.0), kind="stable")
+        num_nodes = min(search.config.num_candidates + 1, int(here.sum()))
+        yield [rows[k] for k in order[:num_nodes]]
+        of_places[here] = 0.0
+
+
+def count_votes(
+    search: Search,
+) -> tuple[
+    list[Row],
+    Float[np.ndarray, "nodes nodes"],
+    Float[np.ndarray, " nodes"],
+    Float[np.ndarray, " nodes"],
+]:
+    """Return the nodes, how far apart they are, the votes of the place around each node, and of
+    features that each node shows itself."""
+    max_nodes = 128  # of a larger map, the nodes that rank first
     max_lag = 0.02  # similarity: a node this near to the nearest one shows the feature, too
     query = search.query
-    rows = [one.row for one in search.map.coarse.rank(query.image, query.features, max_nodes)]
+    ranked = search.map.coarse.rank(query.image, query.features, max_nodes)
+    rows = [one.row for one in ranked if len(search.map.local_map([one.row]).radii)]
     if not rows or not len(query.features):
-        return
+        return [], np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     apart = _distances_between(search, rows)
     similarities = _best_similarities(search, rows)
     nearest, largest = similarities.argmax(axis=0), similarities.max(axis=0)
     elsewhere = np.where(apart[:, nearest] > 2.0, similarities, 0.0).max(axis=0)
     leads = np.maximum(largest - elsewhere, 0.0)
-    of_nodes = (similarities >= largest - max_lag) @ leads
     of_places = (apart <= 1.0) @ np.bincount(nearest, leads, len(rows))
-    least = max(min_share * of_places.max(), search.weights.stop.min_votes)
-    for _ in range(max_places):
-        here = apart[int(np.argmax(of_places))] <= 1.0
-        if of_places.max() < least or least == 0.0:
-            return
-        order = np.argsort(-np.where(here, of_nodes, -1.0), kind="stable")
-        num_nodes = min(search.config.num_candidates + 1, int(here.sum()))
-        yield [rows[k] for k in order[:num_nodes]]
-        of_places[here] = 0.0
+    return rows, apart, of_places, (similarities >= largest - max_lag) @ leads
 
 
 def _distances_between(search: Search, rows: list[Row]) -> Float[np.ndarray, "nodes nodes"]:
