@@ -42,7 +42,7 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     A pose whose points lie in less than `narrow_spread` of the image may show one of several equal
     doors, which fits less precisely. It has at most the log-odds `max_narrow_log_odds` at a doubt
     of 0.1, and `narrow_doubt` more for each e-fold of it. These numbers were fitted to images that
-    look aside or back in corridors of seeds 2 and 3 (docs/journal/localization.md).
+    look aside or back in corridors of seeds 1 to 3 (`benchmarks/aside_fits.py`).
     """
 
     even_share: Finite
@@ -190,10 +190,9 @@ class NodeStop(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold when the nodes of a map are given up (`schedule.py`).
 
     If the retrieved nodes give fewer than `min_inliers` inliers, a right pose would have shown
-    itself, and only virtual views are compared. No place with fewer than `min_votes` (`votes.py`)
-    is compared. Without `continues_earlier`, feature types that
-    precede this one are not continued if it finds no pose. The defaults never give up. `corpus` is
-    what they were fitted to.
+    itself, and of other nodes only places with `min_votes` (`votes.py`) are compared. Without
+    `continues_earlier`, feature types that precede this one are not continued if it finds no pose.
+    The defaults never give up. `corpus` is what they were fitted to.
     """
 
     min_inliers: int = 0

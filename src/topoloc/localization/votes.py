@@ -67,8 +67,9 @@ def count_votes(
     apart = _distances_between(search, rows)
     similarities = _best_similarities(search, rows)
     nearest, largest = similarities.argmax(axis=0), similarities.max(axis=0)
-    elsewhere = np.where(apart[:, nearest] > 2.0, similarities, 0.0).max(axis=0)
-    leads = np.maximum(largest - elsewhere, 0.0)
+    elsewhere = np.where(apart[:, nearest] > 2.0, similarities, -1.0).max(axis=0)
+    # where no node is elsewhere, a feature leads over none
+    leads = np.where(elsewhere > -1.0, np.maximum(largest - elsewhere, 0.0), 0.0)
     of_places = (apart <= 1.0) @ np.bincount(nearest, leads, len(rows))
     return rows, apart, of_places, (similarities >= largest - max_lag) @ leads
 

@@ -1,0 +1,83 @@
+"""Places by votes of single features, when the coarse localizer ranks others first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import built_room, unseen_views
+from doubled_room import twice
+from tiny_world import CAMERA
+from topoloc.features.features import Features
+from topoloc.geometry.alignment import translation_error
+from topoloc.localization import schedule, votes
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.search import Search, Trace
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import Row
+from topoloc.retrieval.coarse import Image, NodeScore
+
+
+@pytest.fixture(scope="module")
+def room(tiny_recording: Path) -> TopoMetricMap:
+    """Two rooms that are alike in a fifth of their points."""
+    return twice(built_room(tiny_recording), share_alike=0.2)
+
+
+class OtherRoomFirst:
+    """Rank the nodes of the second room before those of the first."""
+
+    def __init__(self, topomap: TopoMetricMap) -> None:
+        self._num_nodes = len(topomap.nodes)
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        rows = reversed(range(self._num_nodes))
+        return [NodeScore(Row(row), float(row + 1)) for row in rows][:num_candidates]
+
+
+def test_votes_find_the_place_when_other_nodes_rank_first(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
+    localizer, trace = Localizer(room, coarse=OtherRoomFirst(room)), Trace()
+    views = unseen_views()
+    for picture, truth in views:
+        found = localizer.localize(picture, CAMERA, trace=trace)
+        assert isinstance(found, Localization)
+        assert translation_error(found.world_from_cam, truth) < 0.05
+    assert "votes" in {one.source for one in trace.tried}
+    monkeypatch.setattr(schedule, "propose_voted_places", lambda _: iter(()))
+    lost = [localizer.localize(picture, CAMERA) for picture, _ in views]
+    assert sum(isinstance(one, NotLocalized) for one in lost) >= len(views) // 2
+
+
+def test_votes_are_few_elsewhere_and_nodes_left_out_have_none(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
+    counted, count_votes = list[tuple[list[int], float]](), votes.count_votes
+
+    def noting(search: Search):
+        found = count_votes(search)
+        counted.append(([search.map.node_ids[row] for row in found[0]], found[2].max()))
+        return found
+
+    monkeypatch.setattr(votes, "count_votes", noting)
+    localizer = Localizer(room, coarse=OtherRoomFirst(room))
+    for picture, _ in unseen_views():
+        localizer.localize(picture, CAMERA)
+    here = [most for _, most in counted]
+    counted.clear()
+    for picture, _ in unseen_views(seed=1, step=4.0):
+        assert isinstance(localizer.localize(picture, CAMERA), NotLocalized)
+    assert max(most for _, most in counted) < min(here)
+    counted.clear()
+    localizer.without([0, 1]).localize(unseen_views()[0][0], CAMERA)
+    assert counted
+    assert not {0, 1} & {*counted[0][0]}
+
+
+def test_a_blank_image_has_no_place(room: TopoMetricMap):
+    blank = np.full((240, 320), 128, np.uint8)
+    assert isinstance(Localizer(room).localize(blank, CAMERA), NotLocalized)
