@@ -4,10 +4,11 @@
 
 - **prior**: the nodes nearest to the expected pose.
 - **retrieval**: the pooled points of the nodes that the coarse localizer ranks first.
-- **look-alikes**: similar places. A second place is hidden by the pool of the best candidates. If
-  its nodes are in the pool, points of both places fail the ratio test. If they are not, they are
-  not searched. So nodes with similar scores, far from the current best pose, are searched on their
-  own.
+- **votes**: places that single features point to (`votes.py`), if no pose is clear.
+- **look-alikes**: similar places, if a pose is clear. A second place is hidden by the pool of the
+  best candidates. If its nodes are in the pool, points of both places fail the ratio test. If they
+  are not, they are not searched. So nodes with similar scores, far from the pose, are searched on
+  their own.
 - **viewpoints**: node viewpoints as pose priors. In darkness most true matches fail the ratio test,
   because some other descriptor is always as similar. A camera near a node sees the same points at
   about the same pixels, sizes and angles as the node. Among the few key points that fit, the most

@@ -5,7 +5,7 @@ feature type of one tile. The schedule skips what the beliefs make needless, and
 deadline only the proposal at hand is finished.
 
 **Sources** of a feature type, cheapest first: a prior pose alone; or retrieval, poses of the
-preceding type, node viewpoints, similar places, repetitions and virtual views. If another type
+preceding type, votes, node viewpoints, similar places, repetitions, virtual views. If another type
 follows and the pose is not clear, only retrieval is used; if `is_hopeless`, virtual views follow.
 
 **Feature types** of a tile: each next one is used if the pose is not settled. If none localizes the
