@@ -36,7 +36,7 @@ import numpy as np
 
 from topoloc.localization import schedule
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.propose import propose_first
+from topoloc.localization.proposals.propose import propose_first
 from topoloc.localization.query import QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search, Trace
@@ -45,7 +45,13 @@ from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 
-SOURCES = ("from_other_features", "node_viewpoints", "similar_places", "repetitions")
+SOURCES = (
+    "from_other_features",
+    "voted_places",
+    "node_viewpoints",
+    "similar_places",
+    "repetitions",
+)
 Answer = dict[str, Any]
 spent: dict[str, float] = defaultdict(float)
 

@@ -13,10 +13,11 @@ from built_corridor import WIDE, corridor_of_two_kinds
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import MapError
-from topoloc.localization import propose, schedule
+from topoloc.localization import schedule
 from topoloc.localization.fitted_weights import NodeStop
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.propose import min_rival_inliers, propose_quick
+from topoloc.localization.proposals import propose
+from topoloc.localization.proposals.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import find_best_case_evidence
 from topoloc.localization.result import Localization, NotLocalized

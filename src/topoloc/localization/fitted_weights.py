@@ -1,14 +1,12 @@
 """Hold the values fitted to data: the weights of the evidence and the correlated errors of a map.
 
 The weights come from a logistic regression on right and wrong poses, whose inputs are logarithms of
-the evidence (`evidence.py`). Constants added to them reduce the influence of small counts. The
-weight of the normalized uncertainty is set by hand: wrong places in a corridor of many doors have
-precise poses, and a free weight would go to zero.
+the evidence (`evidence.py`), with constants for small counts. The weight of the normalized
+uncertainty is set by hand: a free weight would go to zero in corridors of many doors.
 
 All probabilities and covariances depend on these values. Each feature type has its own file
-`weights/KIND.json`. It also holds the corpus, the command, and the calibration error on places
-outside the fit. They are not settings. A feature type without a file uses the weights of a similar
-type, and its results are marked as not calibrated.
+`weights/KIND.json`, with the corpus, the command, and the calibration error on places outside the
+fit. A type without a file uses the weights of a similar one; its results are not calibrated.
 """
 
 from __future__ import annotations
@@ -39,10 +37,9 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     A pose with more than `clear_log_odds` is clear. Only very similar places of the map are then
     searched. A pose with less than `hopeless_log_odds` cannot become probable by more matches.
 
-    A pose whose points lie in less than `narrow_spread` of the image may show one of several equal
-    doors, which fits less precisely. It has at most the log-odds `max_narrow_log_odds` at a doubt
-    of 0.1, and `narrow_doubt` more for each e-fold of it. These numbers were fitted to images that
-    look aside or back in corridors of seeds 1 to 3 (`benchmarks/aside_fits.py`).
+    A pose whose points lie in less than `narrow_spread` of the image, such as a door, has at most
+    `max_narrow_log_odds` at a doubt of 0.1, and `narrow_doubt` more for each e-fold of it
+    (`benchmarks/aside_fits.py`, corridors of seeds 1 to 3, aside and in reverse).
     """
 
     even_share: Finite
@@ -96,8 +93,7 @@ class WallStop(Struct, frozen=True, forbid_unknown_fields=True):
     First, the parts of both views within `near_tangent` ahead are compared alone (0: never). Of the
     `num_strong` strongest features of each view, `min_strong` matches must agree on one pose at
     some place. The same holds at each place for the whole views, where `min_agreeing` matches of
-    all features must agree, too. The defaults are for feature types that these numbers were not
-    fitted to. `corpus` is what they were fitted to.
+    all features must agree, too. The defaults are not fitted; `corpus` is that of others.
     """
 
     near_tangent: Finite = 0.0
@@ -191,8 +187,8 @@ class NodeStop(Struct, frozen=True, forbid_unknown_fields=True):
 
     If the retrieved nodes give fewer than `min_inliers` inliers, a right pose would have shown
     itself, and of other nodes only places with `min_votes` (`votes.py`) are compared. Without
-    `continues_earlier`, feature types that precede this one are not continued if it finds no pose.
-    The defaults never give up. `corpus` is what they were fitted to.
+    `continues_earlier`, earlier feature types are not continued if this one finds no pose. The
+    defaults never give up. `corpus` is what they were fitted to.
     """
 
     min_inliers: int = 0

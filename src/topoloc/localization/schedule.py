@@ -31,7 +31,7 @@ from topoloc.errors import MapError, ObjectStoreError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact.last_step import make_precise
 from topoloc.localization.map_context import MapContext
-from topoloc.localization.propose import (
+from topoloc.localization.proposals.propose import (
     min_rival_inliers,
     propose_first,
     propose_from_other_features,
@@ -40,6 +40,7 @@ from topoloc.localization.propose import (
     propose_repetitions,
     propose_similar_places,
 )
+from topoloc.localization.proposals.votes import propose_voted_places
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import confirm_hypotheses, find_best_case_evidence
 from topoloc.localization.result import Localization
@@ -58,7 +59,6 @@ from topoloc.localization.tiles.tiles import (
     merge_tile_results,
     ranking_margin,
 )
-from topoloc.localization.votes import propose_voted_places
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 
 TileProposals = Generator[Proposal, None, ResultWithInliers]

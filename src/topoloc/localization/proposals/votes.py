@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Float32
 
-from topoloc.localization.propose import create_matcher, match_and_fit
+from topoloc.localization.proposals.propose import create_matcher, match_and_fit
 from topoloc.localization.refine import NodeProposal
 from topoloc.localization.search import Search
 from topoloc.node_ids import Row

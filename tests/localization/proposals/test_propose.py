@@ -16,12 +16,13 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import localizer as localizer_module, propose, schedule
+from topoloc.localization import localizer as localizer_module, schedule
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointMatches, PoseFit
+from topoloc.localization.proposals import propose
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import NodeProposal, is_already_found
 from topoloc.localization.result import Localization, NotLocalized

@@ -12,9 +12,10 @@ from doubled_room import twice
 from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
-from topoloc.localization import schedule, votes
+from topoloc.localization import schedule
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.proposals import votes
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
