@@ -181,7 +181,8 @@ def _min_log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) ->
 
 def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
     """Return whether the best hypothesis is not clear and the other is at another place."""
-    if search.weights.of(best.evidence).is_clear(best.log_odds):
+    is_vague = not other.evidence.is_of_nodes and other.evidence.doubt > 1.0  # a wall, somewhere
+    if search.weights.of(best.evidence).is_clear(best.log_odds) or is_vague:
         return False
     max_distance, max_angle = 2.0 * search.config.evidence.max_translation, math.radians(10.0)
     return not best.world_from_cam.is_same(other.world_from_cam, max_distance, max_angle)
