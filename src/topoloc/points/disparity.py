@@ -15,9 +15,8 @@ from jaxtyping import Float, Float32
 from topoloc.errors import RecordingError
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import depth_sigmas
 from topoloc.points.epipolar_kernels import match_in_ranges
-from topoloc.points.metric_points import smooth_depth
+from topoloc.points.metric_points import measure_depths
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 
@@ -86,9 +85,9 @@ def measure_disparities(
     max_sigma_px = 1.0  # disparities with a larger standard deviation are not used
     left, right, rig = measured.left, measured.right, measured.view.rig
     if measured.view.depth is not None:
-        depth = smooth_depth(measured.view.depth, points_img)
-        sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
-        return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_DEPTH_SIGMA_PX)
+        depth, sigma_z = measure_depths(measured.view.depth, left.shape, points_img)
+        sigmas = np.maximum(measured.stereo.bf / depth**2 * sigma_z, _MIN_DEPTH_SIGMA_PX)
+        return np.where(sigmas < max_sigma_px, measured.stereo.bf / depth, np.nan), sigmas
     if right is None or rig is None:
         raise RecordingError("disparities need a stereo pair or a depth image")
     at_infinity = rig.left.cx - rig.right.cx
