@@ -109,6 +109,13 @@ class PreparedFrame:
     depth: Float32[np.ndarray, "h w"] | None = None
     raw_camera: Camera | None = None
 
+    @property
+    def is_located(self) -> bool:
+        """Return whether a pair, or depth of every pixel, locates the features without other
+        images."""
+        has_depth = self.depth is not None and self.depth.shape == self.grey.shape
+        return self.right_grey is not None or has_depth
+
 
 def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
     """Rectify a stereo pair, or register depth to the camera of the image.
