@@ -209,7 +209,8 @@ def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarra
     wins. Depth that is coarser than the image of `camera` stays so."""
     height, width = depth_image.depth.shape
     identity = np.allclose(depth_image.cam_from_depth.matrix(), np.eye(4), atol=1e-9)
-    if identity and depth_image.camera in (camera, camera.rescaled(width, height)):
+    is_finer = width > camera.width
+    if identity and depth_image.camera in (camera, camera.rescaled(width, height)) and not is_finer:
         return depth_image.depth
     density = depth_image.camera.fx / camera.fx
     if density < 0.7:  # else most pixels of the image would get no depth

@@ -50,9 +50,9 @@ from topoloc.plugin import (
     EncodedImage,
     IndexedFrames,
     RecordingFormat,
+    depth_image_of,
     find_white_level,
     match_times,
-    registered_depth,
 )
 
 MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
@@ -121,7 +121,8 @@ class BagRecording(IndexedFrames):
             message, name = self._read_message(images, row)
             depth = decode_depth(message, name)
             if camera == self.camera:  # registered, and may be coarser
-                return replace(frame, depth=registered_depth(name, depth, camera))
+                depth_image = depth_image_of(name, depth, camera, cam_from_depth)
+                return replace(frame, depth=depth_image)
             _check_size(name, depth.shape, camera)
             return replace(frame, depth=DepthImage(depth, camera, cam_from_depth))
         return frame
