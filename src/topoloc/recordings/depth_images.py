@@ -54,7 +54,7 @@ def depth_image_of(
         if abs(width * camera.height - height * camera.width) > rounding:
             raise UnreadableImageError(
                 f"{path}: depth of {width}x{height} is not of the shape of its"
-                f" {camera.width}x{camera.height} picture"
+                f" {camera.width}x{camera.height} picture; crop the one that shows more"
             )
         camera = camera.rescaled(width, height)
     return DepthImage(depth, camera, cam_from_depth or Rigid3.identity())

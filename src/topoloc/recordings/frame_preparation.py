@@ -106,7 +106,7 @@ class PreparedFrame:
     view_from_cam: Rigid3
     right_grey: UInt8[np.ndarray, "h w"] | None = None
     rig: StereoRig | None = None
-    depth: Float32[np.ndarray, "h w"] | None = None
+    depth: Float32[np.ndarray, "coarse_h coarse_w"] | None = None
     raw_camera: Camera | None = None
 
     @property
