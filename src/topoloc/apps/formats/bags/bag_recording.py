@@ -121,8 +121,7 @@ class BagRecording(IndexedFrames):
             message, name = self._read_message(images, row)
             depth = decode_depth(message, name)
             if camera == self.camera:  # registered, and may be coarser
-                depth_image = depth_image_of(name, depth, camera, cam_from_depth)
-                return replace(frame, depth=depth_image)
+                return replace(frame, depth=depth_image_of(name, depth, camera, cam_from_depth))
             _check_size(name, depth.shape, camera)
             return replace(frame, depth=DepthImage(depth, camera, cam_from_depth))
         return frame
