@@ -56,8 +56,8 @@ if TYPE_CHECKING:
         read_camera_json as read_camera_json,
     )
     from topoloc.recordings.depth_images import (
+        depth_image_of as depth_image_of,
         read_depth_image as read_depth_image,
-        resize_depth as resize_depth,
     )
     from topoloc.recordings.format import (
         RecordingFormat as RecordingFormat,
@@ -122,7 +122,7 @@ _NAMES = {
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",
-    "topoloc.recordings.depth_images": "read_depth_image resize_depth",
+    "topoloc.recordings.depth_images": "read_depth_image depth_image_of",
     "topoloc.recordings.format": (
         "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"
     ),

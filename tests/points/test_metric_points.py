@@ -132,6 +132,32 @@ def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[PreparedFram
     assert located.points_cam[0, 2] == pytest.approx(2.0)
 
 
+def test_coarse_depth_is_exact_on_planes_and_uncertain_where_edges_are_smeared(
+    room_view: tuple[PreparedFrame, np.ndarray],
+):
+    camera = room_view[0].camera
+    coarse = camera.rescaled(camera.width // 8, camera.height // 8)
+    columns = np.arange(coarse.width)
+    slanted = 1.0 / (0.4 - 0.25 * (columns - coarse.cx) / coarse.fx)
+    jump = np.interp(columns, [18, 22], [2.0, 3.0])
+    for depth, is_plane in ((slanted, True), (jump, False)):
+        depths = np.tile(depth, (coarse.height, 1))
+        x = np.arange(8.0, camera.width - 8.0, 5.0)
+        located = locate_points(
+            points_at([(float(one), 100.0) for one in x]), depth_view(room_view[0], depths)
+        )
+        near_edge, sigma = np.abs(x - 163.5) < 20, np.sqrt(located.covariances[:, 2, 2])
+        z = located.points_cam[:, 2]
+        if is_plane:
+            truth = 1.0 / (0.4 - 0.25 * (x - camera.cx) / camera.fx)
+            np.testing.assert_allclose(z, truth, rtol=1e-3)
+            assert (np.abs(sigma / z - 0.01) < 0.005).all()
+        else:
+            truth = np.where(x < 163.5, 2.0, 3.0)
+            assert (np.abs(z - truth)[near_edge] > 0.1).any()
+            assert (np.abs(z - truth) < 3.0 * sigma).all()
+
+
 def test_no_features_give_no_points(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     for one in (view, depth_view(view, depth)):

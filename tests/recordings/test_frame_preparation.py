@@ -84,6 +84,22 @@ def test_registered_depth_is_what_the_other_camera_would_measure():
     assert (error > 0.1).mean() < 0.03  # at the edges of the boards
 
 
+def test_unregistered_depth_that_is_coarser_than_the_picture_stays_so():
+    panels, world_from_depth = tiny_world.room(), tiny_world.path_pose(1)
+    cam_from_depth = Rigid3(np.eye(3), np.array([-0.03, 0.002, 0.004]))
+    camera = Camera.pinhole(900, 660, 810.0, 804.0, 446.5, 332.5)
+    _, depth = tiny_world.render(panels, world_from_depth, DEPTH_CAMERA)
+    registered = register_depth(
+        DepthImage(depth.astype(np.float32), DEPTH_CAMERA, cam_from_depth), camera
+    )
+    seen_by = camera.rescaled(*registered.shape[::-1])
+    assert seen_by.fx == pytest.approx(DEPTH_CAMERA.fx, rel=0.01)
+    _, expected = tiny_world.render(panels, world_from_depth @ cam_from_depth.inverse(), seen_by)
+    known = np.isfinite(registered) & np.isfinite(expected)
+    assert known.mean() > 0.8
+    assert np.median(np.abs(registered - expected)[known]) < 0.01
+
+
 def test_the_nearest_surface_wins_and_unknown_stays_unknown():
     depth = np.full((120, 160), np.nan, np.float32)
     depth[60, 80], depth[60, 81] = 4.0, 1.0

@@ -130,7 +130,10 @@ def depth_of(array: Any) -> topoloc.DepthImage:
             lambda: changed(rgbd(), depth=depth_of(DEPTH.depth / 1000)),
             "a median depth of 0.002 m .*; the depth_factor divided by 1000",
         ),
-        (lambda: changed(rgbd(), depth=depth_of(DEPTH.depth[:3])), "the depth image is 32x3"),
+        (
+            lambda: changed(rgbd(), depth=depth_of(DEPTH.depth[:3])),
+            "the depth image is 32x3.* rescaled",
+        ),
         (lambda: "a path", "a StereoFrame is expected, not str"),
     ],
 )

@@ -133,7 +133,7 @@ def _resolve_node_config(
     if len(all_depths) == 0:
         raise EmptyMapError(
             f"{frames[0].sequence.name}: no feature with a 3-D position in {len(samples)} pictures"
-            " tried"
+            f" tried{_why_unlocated(frames[0])}"
         )
     return config.nodes.resolved(float(np.median(all_depths)))
 
@@ -164,9 +164,16 @@ def _draft_nodes(
     if not drafts.rows:
         raise EmptyMapError(
             f"{frames[0].sequence.name}: no picture has {MIN_NODE_POINTS} features with a"
-            " 3-D position"
+            f" 3-D position{_why_unlocated(frames[0])}"
         )
     return drafts
+
+
+def _why_unlocated(frame: MappingFrame) -> str:
+    depth = frame.view().depth
+    if depth is None or np.isfinite(depth).any():
+        return ""
+    return f"; depth is unknown (0) in all of {frame.name}, so record it again with depth"
 
 
 def _process_mapping_images(

@@ -1,7 +1,8 @@
 """Read the frames of a map, extract their features and locate these in 3-D.
 
 A stereo pair or depth image locates its own features. Features of a monocular image are
-triangulated with images around it, from their poses.
+triangulated with images around it, from their poses. These also observe the features of an image
+whose depth is coarser.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ from topoloc.points.motion_triangulation import (
 )
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
-from topoloc.recordings.recording import find_source_path, has_scale
+from topoloc.recordings.recording import find_source_path, has_scale, read_left_frame
 from topoloc.recordings.stored_images import encode_jpeg
 
 R = TypeVar("R")
 
-# Monocular images locate the points of several nodes, so their features are cached.
+# Images locate the points of several nodes around them, so their features are cached.
 _MAX_CACHED_IMAGES = 48
 
 
@@ -185,7 +186,8 @@ def encode_small(picture: Image, side_px: int, encode: Callable[[Image], bytes])
 
 
 class PointLocator:
-    """Locate the features of mapping frames in 3-D. The last monocular images are cached."""
+    """Locate the features of mapping frames in 3-D. The last images that may locate those of others
+    are cached."""
 
     def __init__(self, frames: Sequence[MappingFrame], config: MapConfig) -> None:
         self._config = config
@@ -202,18 +204,18 @@ class PointLocator:
         self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]
     ) -> Iterator[R]:
         """Yield the results of work(frame, frame as read) in order. Frames are processed in
-        parallel, except monocular ones, which read further frames."""
+        parallel, except those that read further frames."""
         for _, of_session in groupby(frames, lambda frame: frame.session_id):
             read = ((frame, frame.read()) for frame in of_session)
             first = next(read)
-            run = map if _is_monocular(first[1]) else parallel_map
+            run = parallel_map if prepare_view(first[1]).is_located else map
             yield from run(work, chain([first], read))
 
     def image(self, frame: MappingFrame, view: PreparedFrame) -> MappingImage:
         """Return the extracted mapping image of a frame, from the cache if possible."""
         if id(frame) not in self._image_cache:
             image = extract_mapping_image(frame, view, self._config)
-            if view.right_grey is not None or view.depth is not None:
+            if view.is_located:
                 return image
             self._image_cache[id(frame)] = image
             if len(self._image_cache) > _MAX_CACHED_IMAGES:
@@ -224,17 +226,14 @@ class PointLocator:
     def locate(
         self, frame: MappingFrame, view: PreparedFrame, image: MappingImage
     ) -> tuple[dict[str, MetricPoints], list[MappingFrame]]:
-        """Return the positions of a frame's features by type, and the other frames used to
-        triangulate them."""
-        if view.right_grey is not None or view.depth is not None:
-            return {
-                kind: locate_points(features, view) for kind, features in image.features.items()
-            }, []
-        frames = self._sessions[frame.session_id]
-        poses = [other.world_from_cam for other in frames]
-        chosen = select_source_images(poses, frames.index(frame), self._steps[frame.session_id])
-        others = [frames[k] for k in chosen]
-        images, points = [self.image(other, other.view()) for other in others], {}
+        """Return the positions of a frame's features by type, and the other frames that are needed:
+        those used to triangulate them, or, if they have coarse depth, those that are to observe
+        them (`image_of`)."""
+        others = [] if view.is_located else self._select_others(frame)
+        if view.is_located or view.depth is not None:
+            of_kind = image.features.items()
+            return {kind: locate_points(features, view) for kind, features in of_kind}, others
+        images, points = [self.image_of(other) for other in others], {}
         for kind, features in image.features.items():
             source_images = [
                 SourceImage(
@@ -248,3 +247,17 @@ class PointLocator:
             sigmas = keypoint_sigmas(features)
             points[kind] = triangulate_from_motion(features, sigmas, image.camera, source_images)
         return points, others
+
+    def image_of(self, frame: MappingFrame) -> MappingImage:
+        """Return the mapping image of a frame that locates the features of others, from the cache
+        if possible."""
+        if id(frame) not in self._image_cache:
+            read = read_left_frame(frame.sequence, frame.index)
+            return self.image(frame, prepare_view(read, with_depth=False))
+        self._image_cache.move_to_end(id(frame))
+        return self._image_cache[id(frame)]
+
+    def _select_others(self, frame: MappingFrame) -> list[MappingFrame]:
+        frames, step = self._sessions[frame.session_id], self._steps[frame.session_id]
+        poses = [other.world_from_cam for other in frames]
+        return [frames[k] for k in select_source_images(poses, frames.index(frame), step)]

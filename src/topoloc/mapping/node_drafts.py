@@ -50,7 +50,7 @@ class DraftPoints:
 @dataclass(frozen=True, eq=False)
 class NodeDraft:
     """Hold a draft node with its points by feature type. `summary` has no id and no points yet.
-    `sources` are the frames of the first measurement."""
+    `sources` are the frames that measured or observed them so far."""
 
     summary: NodeSummary
     frame: MappingFrame
@@ -130,13 +130,16 @@ def create_node_draft(
     )
     sides = (
         create_virtual_nodes(summary, view, config.feature_config_for(config.virtual_view_type))
-        if has_virtual_views and not sources
+        if has_virtual_views and (not sources or view.depth is not None)
         else []
     )
     raw_camera = view.raw_camera or image.camera
-    return NodeDraft(
+    draft = NodeDraft(
         summary, frame, image, template_image, points, sides, [frame, *sources], raw_camera
     )
+    for source in sources if view.depth is not None else []:
+        draft.add(observe_draft(draft, locator.image_of(source), frame.session_id))
+    return draft
 
 
 def observe_draft(

@@ -7,17 +7,17 @@ image is converted to the disparity that a second camera 8 cm to the right would
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
 from topoloc.errors import RecordingError
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import depth_sigmas
 from topoloc.points.epipolar_kernels import match_in_ranges
-from topoloc.points.metric_points import smooth_depth
+from topoloc.points.metric_points import measure_depths
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 
@@ -56,9 +56,13 @@ class MeasuredView:
 
 
 def measured_view(frame: StereoFrame) -> MeasuredView:
-    """Prepare a frame for measurements. Raises CalibrationError and RecordingError like
-    `prepare_frame`."""
+    """Prepare a frame for measurements, with depth of every pixel. Raises CalibrationError and
+    RecordingError like `prepare_frame`."""
     view = prepare_frame(frame)
+    if view.depth is not None and not view.is_located:
+        # Tracks need many points on slanted walls more than they need the right sigmas of edges.
+        depth = cv2.resize(view.depth, view.grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        view = replace(view, depth=depth)
     left = view.grey.astype(np.float32)
     baseline, right = _DEPTH_BASELINE, None
     if view.right_grey is not None and view.rig is not None:
@@ -86,8 +90,8 @@ def measure_disparities(
     max_sigma_px = 1.0  # disparities with a larger standard deviation are not used
     left, right, rig = measured.left, measured.right, measured.view.rig
     if measured.view.depth is not None:
-        depth = smooth_depth(measured.view.depth, points_img)
-        sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
+        depth, sigma_z = measure_depths(measured.view.depth, left.shape, points_img)
+        sigmas = measured.stereo.bf / depth**2 * sigma_z
         return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_DEPTH_SIGMA_PX)
     if right is None or rig is None:
         raise RecordingError("disparities need a stereo pair or a depth image")

@@ -5,12 +5,13 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float32
 
 from topoloc.errors import MissingExtraError, RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.frame import DepthImage
 from topoloc.recordings.frame_checks import find_depth_problem
 from topoloc.recordings.image_io import MAX_PIXELS, read_depth
 
@@ -36,24 +37,27 @@ def read_depth_image(path: Path, units_per_metre: float) -> Float32[np.ndarray, 
     return depth
 
 
-def resize_depth(
-    path: Path | str, depth: Float32[np.ndarray, "h w"], camera: Camera
-) -> Float32[np.ndarray, "h2 w2"]:
-    """Resize a depth image to the image of `camera`. Pixels beside unknown depth become unknown.
+def depth_image_of(
+    path: Path | str,
+    depth: Float32[np.ndarray, "h w"],
+    camera: Camera,
+    cam_from_depth: Rigid3 | None = None,
+) -> DepthImage:
+    """Return depth taken by `camera`, at any resolution of its aspect ratio.
 
     Raises:
-        UnreadableImageError: its aspect ratio differs from the image's.
+        UnreadableImageError: the aspect ratio differs.
     """
     height, width = depth.shape
-    if (width, height) == (camera.width, camera.height):
-        return depth
-    rounding = max(camera.width, camera.height)  # of a pixel
-    if abs(width * camera.height - height * camera.width) > rounding:
-        raise UnreadableImageError(
-            f"{path}: depth of {width}x{height} is not of the shape of its"
-            f" {camera.width}x{camera.height} picture"
-        )
-    return cv2.resize(depth, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    if (width, height) != (camera.width, camera.height):
+        rounding = max(camera.width, camera.height)  # of a pixel
+        if abs(width * camera.height - height * camera.width) > rounding:
+            raise UnreadableImageError(
+                f"{path}: depth of {width}x{height} is not of the shape of its"
+                f" {camera.width}x{camera.height} picture; crop the one that shows more"
+            )
+        camera = camera.rescaled(width, height)
+    return DepthImage(depth, camera, cam_from_depth or Rigid3.identity())
 
 
 def _read_npy(path: Path) -> np.ndarray:

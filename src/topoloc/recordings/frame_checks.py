@@ -135,7 +135,9 @@ def _find_depth_problem(depth: Any) -> str | None:
             what = f"{array.dtype} of shape {array.shape}"
         meant = "depth is float32 (height, width) in metres, NaN where unknown"
         return f"{meant}, not {what}; of millimetres: depth.astype(np.float32) / 1000"
-    return _find_size_problem("the depth image", array, depth.camera) or find_depth_problem(array)
+    if problem := _find_size_problem("the depth image", array, depth.camera):
+        return f"{problem}; coarser depth has the camera of its image, rescaled(width, height)"
+    return find_depth_problem(array)
 
 
 def find_depth_problem(depth: Float32[np.ndarray, "h w"]) -> str | None:

@@ -95,8 +95,9 @@ class PreparedFrame:
 
     `picture` is the image for display, and `grey` the image for feature extraction. Both belong to
     `camera`. Stereo pairs are rectified and have `right_grey` and the rectified `rig`. RGB-D frames
-    have `depth` in metres, in pixels of `camera`, NaN if unknown. `view_from_cam` is the rotation
-    of the frame's camera by rectification. `raw_camera` is the camera before that.
+    have `depth` in metres, NaN if unknown. It has the view of `camera` and may be coarser than
+    `grey`. `view_from_cam` is the rotation of the frame's camera by rectification. `raw_camera` is
+    the camera before that.
     """
 
     picture: Image
@@ -105,8 +106,15 @@ class PreparedFrame:
     view_from_cam: Rigid3
     right_grey: UInt8[np.ndarray, "h w"] | None = None
     rig: StereoRig | None = None
-    depth: Float32[np.ndarray, "h w"] | None = None
+    depth: Float32[np.ndarray, "coarse_h coarse_w"] | None = None
     raw_camera: Camera | None = None
+
+    @property
+    def is_located(self) -> bool:
+        """Return whether a pair, or depth of every pixel, locates the features without other
+        images."""
+        has_depth = self.depth is not None and self.depth.shape == self.grey.shape
+        return self.right_grey is not None or has_depth
 
 
 def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
@@ -198,11 +206,16 @@ def _remap(picture: Image, pixel_map: Float32[np.ndarray, "h w 2"]) -> Image:
 
 def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarray, "h w"]:
     """Register depth to `camera`. Each pixel moves to its projection, and the nearest surface
-    wins."""
-    identity = np.allclose(depth_image.cam_from_depth.matrix(), np.eye(4), atol=1e-9)
-    if identity and depth_image.camera == camera:
-        return depth_image.depth
+    wins. Depth that is coarser than the image of `camera` stays so."""
     height, width = depth_image.depth.shape
+    identity = np.allclose(depth_image.cam_from_depth.matrix(), np.eye(4), atol=1e-9)
+    is_finer = width > camera.width
+    if identity and depth_image.camera in (camera, camera.rescaled(width, height)) and not is_finer:
+        return depth_image.depth
+    density = depth_image.camera.fx / camera.fx
+    if density < 0.7:  # else most pixels of the image would get no depth
+        size = round(density * camera.width), round(density * camera.height)
+        camera = camera.rescaled(*size)
     pose = depth_image.cam_from_depth
     normalized = _normalized_pixels(depth_image.camera, width, height)
     arguments = depth_image.depth, normalized, pose.rotation, pose.translation

@@ -10,7 +10,7 @@ from topoloc.errors import UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.depth_images import read_depth_image, resize_depth
+from topoloc.recordings.depth_images import depth_image_of, read_depth_image
 from topoloc.recordings.frame import (
     DepthImage,
     Image,
@@ -191,7 +191,7 @@ def _depth_image(depth: DepthImages, index: int, camera: Camera) -> DepthImage:
     if depth.camera is not None:
         _check_size(path, metres.shape, depth.camera)
         return DepthImage(metres, depth.camera, depth.cam_from_depth)
-    return DepthImage(resize_depth(path, metres, camera), camera, depth.cam_from_depth)
+    return depth_image_of(path, metres, camera, depth.cam_from_depth)
 
 
 def _read_checked_image(

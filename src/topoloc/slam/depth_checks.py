@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from topoloc.features.parallel import parallel_map
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.frame_preparation import prepare_frame
+from topoloc.recordings.frame_preparation import downscale_image, prepare_frame
 
 _WIDTH, _MAX_SHIFT = 320, 12  # pixels: of the images that are compared
 _ZOOMS = np.linspace(0.84, 1.16, 9)
@@ -49,7 +49,8 @@ def _correlate_edges(frame: StereoFrame) -> Float[np.ndarray, "zooms s s"] | Non
     view, size = prepare_frame(frame), 2 * _MAX_SHIFT + 1
     if (depth := view.depth) is None:
         return None
-    grey = cv2.GaussianBlur(view.grey, (0, 0), 1.5)
+    grey, camera = downscale_image(view.grey, view.camera, max(depth.shape))
+    grey = cv2.GaussianBlur(grey, (0, 0), 1.5)
     contrast = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     contrast = np.minimum(contrast, 4.0 * contrast.mean())
     farther = [np.roll(depth, shift, axis) for axis in (0, 1) for shift in (-2, 2)]
@@ -58,7 +59,7 @@ def _correlate_edges(frame: StereoFrame) -> Float[np.ndarray, "zooms s s"] | Non
     if len(points) < min_pixels:
         return None
     scale = _WIDTH / contrast.shape[1]
-    height, centre = max(1, round(scale * contrast.shape[0])), [view.camera.cy, view.camera.cx]
+    height, centre = max(1, round(scale * contrast.shape[0])), [camera.cy, camera.cx]
     contrast = cv2.resize(contrast, (_WIDTH, height), interpolation=cv2.INTER_AREA)
     mean, shape = float(contrast.mean()), (height + 2 * _MAX_SHIFT, _WIDTH + 2 * _MAX_SHIFT)
     spectrum, scores = np.fft.rfft2(contrast - mean, shape), []

@@ -17,7 +17,6 @@ import numpy as np
 
 from topoloc import (
     Camera,
-    DepthImage,
     RecordingError,
     Rigid3,
     StereoFrame,
@@ -28,10 +27,10 @@ from topoloc.plugin import (
     IndexedFrames,
     RecordingFormat,
     Video,
+    depth_image_of,
     parse_calibration,
     read_depth_image,
     read_text,
-    resize_depth,
 )
 
 EXPECTED_FILES = "rgb.mp4, odometry.csv and camera_matrix.csv of Stray Scanner"
@@ -91,7 +90,7 @@ class StrayRecording(IndexedFrames):
             levels = read_image(confidence)
             if levels.shape == depth.shape:
                 depth = np.where(levels > 0, depth, np.float32(np.nan))
-        return replace(frame, depth=DepthImage(resize_depth(path, depth, camera), camera))
+        return replace(frame, depth=depth_image_of(path, depth, camera))
 
 
 def can_open(path: Path) -> bool:

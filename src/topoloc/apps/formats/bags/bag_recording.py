@@ -50,9 +50,9 @@ from topoloc.plugin import (
     EncodedImage,
     IndexedFrames,
     RecordingFormat,
+    depth_image_of,
     find_white_level,
     match_times,
-    resize_depth,
 )
 
 MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
@@ -121,7 +121,7 @@ class BagRecording(IndexedFrames):
             message, name = self._read_message(images, row)
             depth = decode_depth(message, name)
             if camera == self.camera:  # registered, and may be coarser
-                depth = resize_depth(name, depth, camera)
+                return replace(frame, depth=depth_image_of(name, depth, camera, cam_from_depth))
             _check_size(name, depth.shape, camera)
             return replace(frame, depth=DepthImage(depth, camera, cam_from_depth))
         return frame
