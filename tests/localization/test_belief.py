@@ -281,6 +281,19 @@ def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
         assert isinstance(decide_result(replace(search, weights=strict))[0], Localization) == walls
 
 
+@pytest.mark.parametrize("doubt", [0.9, 1.5])
+def test_an_unclear_pose_of_nodes_must_lead_walls_by_far_only_if_they_could_be_answered(
+    doubt: float,
+):
+    strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
+    behind = 2.5 - WEIGHTS.rivals.lead - 0.1
+    search = believed(
+        [made_hypothesis(2.5), made_hypothesis(behind, x=-9.0, walls=True, doubt=doubt)]
+    )
+    result = decide_result(replace(search, weights=strict))[0]
+    assert isinstance(result, Localization) == (doubt > 1.0)
+
+
 def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
     behind = 3.0 - WEIGHTS.rivals.lead - 0.1
     assert _along(
