@@ -86,6 +86,9 @@ class Localization(_Result):
             include it.
         seen_camera: calibration estimate of this image (`geometry/calibration_check.py`), or None.
         geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
+        appearance: probability that all points in view have the colours of the map rather than
+            those of another floor of the building, if both floors were as likely. The probability
+            includes it. None if the image or the map is grey.
     """
 
     world_from_cam: Rigid3
@@ -105,6 +108,7 @@ class Localization(_Result):
     frame_rotation_deg: float | None = None
     calibration_doubt: CalibrationMismatch | None = None
     seen_camera: IntrinsicsDeviation | None = None
+    appearance: float | None = None
 
     def __repr__(self) -> str:
         sigmas = f"{100 * self.position_sigma_m:.1f} cm, {self.rotation_sigma_deg:.2f} deg"
@@ -155,6 +159,7 @@ class Localization(_Result):
             "frame_rotation_deg": self.frame_rotation_deg,
             "calibration_doubt": self.calibration_doubt and self.calibration_doubt.to_json(),
             "geopose": self.geopose and self.geopose.to_json(),
+            "appearance": self.appearance,
         }
         return {
             "query": query,
@@ -199,7 +204,8 @@ class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "no
 class NotLocalized(_Result):
     """Report that no pose is certain enough, with the `reason`.
 
-    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first.
+    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first. `appearance`
+    is that of a pose that was refused for it.
     """
 
     reason: Reason
@@ -211,6 +217,7 @@ class NotLocalized(_Result):
     alternatives: tuple[Alternative, ...] = ()
     provenance: Provenance = EMPTY_PROVENANCE
     seen_camera: IntrinsicsDeviation | None = None
+    appearance: float | None = None
 
     def __repr__(self) -> str:
         text = ": ".join(filter(None, [self.reason, " ".join(self.detail.split())]))
@@ -227,7 +234,8 @@ class NotLocalized(_Result):
         """Return one line of the result file, see docs/cli.md."""
         alternatives = [one.to_json() for one in self.alternatives]
         refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail}
-        return refusal | {"alternatives": alternatives} | _evidence_json(self)
+        seen = {} if self.appearance is None else {"appearance": self.appearance}
+        return refusal | {"alternatives": alternatives} | seen | _evidence_json(self)
 
 
 R = TypeVar("R", bound=Localization | NotLocalized)
@@ -281,6 +289,7 @@ class _LocalizedLine(_Line, frozen=True, kw_only=True):
     geopose: GeoPose | None = None
     frame_rotation_deg: NonNegative | None = None
     calibration_doubt: CalibrationMismatch | None = None
+    appearance: Share | None = None
 
     def __post_init__(self) -> None:
         diagonal = np.diag(self.covariance)
@@ -293,3 +302,4 @@ class _RefusedLine(_Line, frozen=True, kw_only=True):
     reason: Reason
     detail: str = ""
     alternatives: Annotated[tuple[Alternative, ...], Meta(max_length=10_000)] = ()
+    appearance: Share | None = None

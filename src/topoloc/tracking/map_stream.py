@@ -31,6 +31,7 @@ from topoloc.recordings.frame import to_grey
 from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
+from topoloc.tracking.floor_evidence import FloorEvidence
 from topoloc.tracking.motion import Hypothesis, MotionState, update_motion
 from topoloc.tracking.point_tracker import PointTracker
 from topoloc.tracking.pose_hypotheses import PoseHypotheses
@@ -67,6 +68,7 @@ class MapStream:
         self._last_smoothed: Rigid3 | None = None
         self._reference: ReferenceImage | None = None
         self._last_attempt_ns = 0
+        self._floor = FloorEvidence(localizer.topomap.config.look_alike_floors)
 
     def process(
         self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None, limit: Deadline
@@ -128,6 +130,7 @@ class MapStream:
             self._last_attempt_ns = frame.t_ns
             found = self._stream_localizer.localize(frame, self._predict_pose(predicted, tracked))
             self._drop_stale_reference()
+            self._floor.add(found.result if isinstance(found, LocalizedPose) else found)
             if isinstance(found, LocalizedPose):
                 return self._mark_if_ambiguous(
                     self._update_with_localization(frame, found, predicted, tracked, seconds)
@@ -144,10 +147,12 @@ class MapStream:
 
     def _mark_if_ambiguous(self, answer: StreamedPose) -> StreamedPose:
         """Return the result unchanged if one hypothesis leads, and an ambiguous one otherwise."""
-        if self._hypotheses.is_unambiguous:
+        if self._hypotheses.is_unambiguous and self._floor.is_sure:
             return answer
         alternatives = self._hypotheses.alternatives()
         detail = "too little speaks for this pose so far"
+        if not self._floor.is_sure:
+            detail = "the colours so far leave open whether this is another floor of the building"
         if len(alternatives) > 1:
             detail = "the pictures so far leave open which of these"
         times_ms, provenance = answer.result.times_ms, answer.result.provenance

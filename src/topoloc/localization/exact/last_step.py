@@ -22,6 +22,7 @@ from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.exact.appearance import weigh_appearance
 from topoloc.localization.exact.patch_alignment import (
     LastStepWeights,
     PreciseMatches,
@@ -63,7 +64,12 @@ def make_precise(
     """
     if not has_prior:
         outcome = _reconsider_refusal(searches, outcome)
-    return _refine_result(searches, outcome)
+    result, named = _refine_result(searches, outcome)
+    if isinstance(result, Localization):
+        with searches[0].query.clock.stage("appearance"):
+            result = weigh_appearance(searches[0], result)
+        return result, [(result, points) for _, points in named]
+    return result, named
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
