@@ -84,15 +84,17 @@ def ask(map_file: str, recordings: list[str], arguments: argparse.Namespace) -> 
             if isinstance(found, Localization):
                 row |= {"p": found.probability, "pose": found.world_from_cam.to_json()}
             if isinstance(found, Localization) and seen and seen[-1] is not None:
-                row |= {"colour": seen[-1].correlation, "light": seen[-1].light_change}
+                row["seen"] = [seen[-1].correlation, seen[-1].light_change, seen[-1].contrast]
             with arguments.out.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
 
 
 def fit(rows: list[Row]) -> None:
     """Print the weights."""
-    known = [row for row in rows if "colour" in row]
-    inputs = np.array([[_atanh(row["colour"]), row["light"], 1.0] for row in known])
+    known, noise = [row for row in rows if "seen" in row], load_appearance_weights().noise
+    inputs = np.array([[_atanh(row["seen"][0]), row["seen"][1], 1.0] for row in known])
+    variances = np.array([row["seen"][2] for row in known]) ** 2
+    inputs *= (variances / (variances + noise**2))[:, None]
     signs = np.array([-1.0 if row["other"] else 1.0 for row in known])
     shares = np.where(signs > 0, 0.5 / np.sum(signs > 0), 0.5 / np.sum(signs < 0))
 
@@ -141,9 +143,9 @@ def count(groups: list[list[Row]], weights: AppearanceWeights) -> list[int]:
 
 
 def _log_odds(row: Row, weights: AppearanceWeights) -> float | None:
-    if "colour" not in row:
+    if "seen" not in row:
         return None
-    seen = ColourAgreement(row["colour"], row["light"]).appearance(weights)
+    seen = ColourAgreement(*row["seen"]).appearance(row["p"], weights)
     return math.log(seen / (1.0 - seen))
 
 
@@ -165,8 +167,9 @@ def _is_stream_answer(three: list[Row], odds: float, weights: AppearanceWeights)
     seen = [
         min(max(log, -4.0), 4.0) for row in three if (log := _log_odds(row, weights)) is not None
     ]
-    is_enough = odds < 1.0 or len(seen) == 3
-    return is_one_way and is_enough and sum(seen) >= math.log(odds)
+    is_enough = len(seen) == 3
+    least = math.log(odds) + (3.0 if is_enough else 0.0)
+    return is_one_way and (is_enough or odds < 1.0) and sum(seen) >= least
 
 
 def _atanh(correlation: float) -> float:

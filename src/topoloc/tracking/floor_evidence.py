@@ -24,24 +24,26 @@ class FloorEvidence:
         self._seen = list[tuple[Rigid3 | None, float]]()
 
     def add(self, result: Localization | NotLocalized) -> None:
-        """Add the result of an image. Successive refusals are of one place."""
+        """Add the result of an image, unless it is of the last place. Successive refusals are of
+        one place."""
         max_places, min_metres, min_radians, max_log_odds = 5, 0.5, 0.5, 4.0
-        if result.appearance is None:
-            return
         pose = result.world_from_cam if isinstance(result, Localization) else None
+        is_known = self._seen and _is_same(self._seen[-1][0], pose, min_metres, min_radians)
+        if result.appearance is None or is_known:
+            return
         odds = result.appearance / max(1.0 - result.appearance, 1e-9)
         log_odds = float(np.clip(math.log(max(odds, 1e-9)), -max_log_odds, max_log_odds))
-        if self._seen and _is_same(self._seen[-1][0], pose, min_metres, min_radians):
-            self._seen.pop()
         self._seen = [*self._seen, (pose, log_odds)][-max_places:]
 
     @property
     def is_sure(self) -> bool:
-        """Return whether the places so far are of this floor. In a map with look-alike floors three
-        places must be."""
+        """Return whether the places so far are of this floor. Three places must say so more
+        clearly. In a map with look-alike floors fewer do not suffice."""
+        is_enough = len(self._seen) >= 3
         least = math.log(load_appearance_weights().floor_odds[self._has_look_alikes])
-        is_enough = len(self._seen) >= 3 or not self._has_look_alikes
-        return is_enough and sum(log_odds for _, log_odds in self._seen) >= least
+        least += 3.0 if is_enough else 0.0
+        seen = sum(log_odds for _, log_odds in self._seen)
+        return seen >= least and (is_enough or not self._has_look_alikes)
 
 
 def _is_same(a: Rigid3 | None, b: Rigid3 | None, metres: float, radians: float) -> bool:

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from msgspec import Struct
 
 from topoloc.errors import FeatureTypeError
@@ -23,6 +23,7 @@ from topoloc.localization.evidence import sample_rows
 from topoloc.localization.exact.patch_alignment import sample_colours, small_colours
 from topoloc.localization.guided import select_visible_points
 from topoloc.localization.result import Localization
+from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search
 from topoloc.node_ids import NodeId
 
@@ -30,11 +31,13 @@ from topoloc.node_ids import NodeId
 class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the weights of the appearance, fitted to images of this floor and of other ones.
 
-    - Points of `num_nodes` nodes are compared, at least `min_points`. Colours farther than
-      `max_contrast` (in logarithms) from their median count as that far. `noise` is the standard
-      deviation of colours that are no contrast.
+    - Points of `num_nodes` nodes are compared, at least `min_points`. In each of `parts` (columns,
+      rows) of the image, points beyond `max_depth` times the nearer ones are hidden.
+    - Colours farther than `max_contrast` (in logarithms) from their median count as that far.
+      `noise` is the standard deviation of colours that say nothing, such as those of white walls.
     - The log-odds are `agreement` times the inverse hyperbolic tangent of the correlation, `light`
-      times the standard deviation of the change of brightness, and `bias`.
+      times the standard deviation of the change of brightness, and `bias`. Log-odds of the pose
+      above `clear_log_odds` are added: a room may have been painted.
     - `floor_odds`: how likely an image is of another floor, relative to this one, in most maps and
       in maps with look-alike floors.
     """
@@ -44,11 +47,14 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     command: str
     num_nodes: int
     min_points: int
+    parts: tuple[int, int]
+    max_depth: Finite
     max_contrast: Finite
     noise: Finite
     agreement: Finite
     light: Finite
     bias: Finite
+    clear_log_odds: Finite
     floor_odds: tuple[Finite, Finite]
 
 
@@ -61,37 +67,41 @@ def load_appearance_weights() -> AppearanceWeights:
 
 @dataclass(frozen=True)
 class ColourAgreement:
-    """Hold the correlation of the colours, -1 to 1, and the standard deviation of the change of
-    brightness (natural logarithm)."""
+    """Hold the correlation of the colours, -1 to 1, the standard deviation of the change of
+    brightness, and that of the colours where it is less: in the image or in the map."""
 
     correlation: float
     light_change: float
+    contrast: float
 
-    def appearance(self, weights: AppearanceWeights) -> float:
-        """Return `Localization.appearance`."""
-        log_odds = (
-            weights.agreement * math.atanh(min(max(self.correlation, -0.97), 0.97))
-            + weights.light * self.light_change
-            + weights.bias
-        )
-        return 1.0 / (1.0 + math.exp(-log_odds))
+    def appearance(self, probability: float, weights: AppearanceWeights) -> float:
+        """Return `Localization.appearance` of a pose with this probability without it."""
+        correlation = min(max(self.correlation, -0.97), 0.97)
+        log_odds = weights.agreement * math.atanh(correlation) + weights.light * self.light_change
+        share = self.contrast**2 / (self.contrast**2 + weights.noise**2)
+        known = min(max(probability, 0.5), 0.9999)
+        clear = max(0.0, math.log(known / (1.0 - known)) - weights.clear_log_odds)
+        return 1.0 / (1.0 + math.exp(-share * (log_odds + weights.bias) - clear))
 
 
 def compare_colours(search: Search, found: Localization) -> ColourAgreement | None:
-    """Compare the colours of the points in view. None: an image is grey, or has one colour."""
+    """Compare the colours of the points in view. None: an image is grey, or shows few
+    points of the map."""
     weights, query = load_appearance_weights(), search.query
     in_query = small_colours(query.image)
     if in_query is None:
         return None
     # the nodes near a pose beside a bend look past its walls; those of its inliers do not
-    topomap = search.map.topomap
+    topomap, camera = search.map.topomap, query.camera
     seen_from = topomap.summaries[topomap.row_of(found.node_id)].world_from_cam
     points = search.map.local_map(search.map.nearest(seen_from, weights.num_nodes))
     cam_from_world = found.world_from_cam.inverse()
-    rows, pixels = select_visible_points(points, cam_from_world, query.camera)
-    sampled = sample_rows(len(rows)) if len(rows) else rows
-    rows, of_map = rows[sampled], np.full((len(sampled), 3), np.nan)
-    of_query = sample_colours(in_query, pixels[sampled], query.camera)
+    rows, pixels = select_visible_points(points, cam_from_world, camera)
+    size = np.array([camera.width, camera.height])
+    depths = cam_from_world.apply(points.points_world[rows])[:, 2]
+    shown = np.flatnonzero(_is_shown(pixels / size, depths, weights))
+    sampled = shown[sample_rows(len(shown))] if len(shown) else shown
+    rows, pixels, of_map = rows[sampled], pixels[sampled], np.full((len(sampled), 3), np.nan)
     for node_id in np.unique(points.node_ids[rows]):
         template = search.template(NodeId(int(node_id)))
         if template.colours is not None:
@@ -99,48 +109,68 @@ def compare_colours(search: Search, found: Localization) -> ColourAgreement | No
             in_node = template.world_from_cam.inverse().apply(points.points_world[rows[of_node]])
             at = template.camera.img_from_cam(in_node)
             of_map[of_node] = sample_colours(template.colours, at, template.camera)
-    known = np.isfinite(of_map[:, 0]) & np.isfinite(of_query[:, 0])
+    known = np.isfinite(of_map[:, 0])
     if np.count_nonzero(known) < weights.min_points:
         return None
-    size = [query.camera.width, query.camera.height]
-    x, y = (2.0 * pixels[sampled][known] / size - 1.0).T
-    slow = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-    return _correlate(of_query[known], of_map[known], slow, weights)
+    of_query = sample_colours(in_query, pixels[known], camera)
+    return _correlate(of_query, of_map[known], pixels[known] / size, weights)
+
+
+def _is_shown(
+    places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, " n"], weights: AppearanceWeights
+) -> Bool[np.ndarray, " n"]:
+    """Return which points are not hidden by nearer ones. Places are pixels over the image size."""
+    counts = np.array(weights.parts)
+    columns, rows = np.clip(places * counts, 0, counts - 1).astype(int).T
+    part = rows * counts[0] + columns
+    order = np.lexsort((depths, part))
+    numbers = np.bincount(part, minlength=int(counts.prod()))
+    near_share = 0.2  # points that are nearer belong to thin things
+    nearer = np.cumsum(numbers) - numbers + (near_share * numbers).astype(int)
+    return depths <= weights.max_depth * depths[order[np.minimum(nearer, len(order) - 1)]][part]
 
 
 def _correlate(
     of_query: Float[np.ndarray, "n 3"],
     of_map: Float[np.ndarray, "n 3"],
-    slow: Float[np.ndarray, "n 6"],
+    places: Float[np.ndarray, "n 2"],
     weights: AppearanceWeights,
-) -> ColourAgreement | None:
+) -> ColourAgreement:
     """Correlate colours, given as brightness, red over green and blue over yellow."""
+    x, y = (2.0 * places - 1.0).T
+    slow = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     both = np.column_stack([of_query[:, 1:], of_map[:, 1:]])
-    contrasts = np.clip(both - np.median(both, axis=0), -weights.max_contrast, weights.max_contrast)
-    contrasts -= slow @ np.linalg.lstsq(slow, contrasts, rcond=None)[0]
-    variances = np.mean(contrasts**2, axis=0)
-    if variances.max() < weights.noise**2:
-        return None
-    products = np.mean(contrasts[:, :2] * contrasts[:, 2:], axis=0)
-    correlations = products / np.sqrt(np.multiply(*np.split(variances + weights.noise**2, 2)))
+    colours = np.clip(both - np.median(both, axis=0), -weights.max_contrast, weights.max_contrast)
+    colours -= slow @ np.linalg.lstsq(slow, colours, rcond=None)[0]
+    products = np.mean(colours[:, :2] * colours[:, 2:], axis=0)
+    variances = np.mean(colours**2, axis=0).reshape(2, 2)
+    least_variance = 1e-4  # of the noise of pixels
+    correlations = products / np.sqrt((variances + least_variance).prod(axis=0))
     light_change = float(np.std(of_query[:, 0] - of_map[:, 0]))
-    return ColourAgreement(float(correlations.mean()), light_change)
+    contrast = math.sqrt(variances.mean(axis=1).min())  # a grey image says nothing
+    return ColourAgreement(float(correlations.mean()), light_change, contrast)
 
 
-def weigh_appearance(search: Search, found: Localization) -> Localization:
-    """Return the pose with its appearance, which the probability includes.
+def weigh_appearance(search: Search, outcome: ResultWithInliers) -> ResultWithInliers:
+    """Return the outcome with the appearance of its pose, which the probability includes.
 
     Without colours nothing tells floors apart, and a map with look-alike floors is honest about it.
     """
+    found, named = outcome
+    if not isinstance(found, Localization):
+        return outcome
     weights, has_look_alikes = (
         load_appearance_weights(),
         search.map.topomap.config.look_alike_floors,
     )
-    agreement = compare_colours(search, found) if found.is_of_nodes else None
+    with search.query.clock.stage("appearance"):
+        agreement = compare_colours(search, found) if found.is_of_nodes else None
     if agreement is None and not has_look_alikes:
-        return found
-    appearance = None if agreement is None else agreement.appearance(weights)
-    this_floor = 0.5 if appearance is None else appearance
+        return outcome
+    appearance, this_floor = None, 0.5
+    if agreement is not None:
+        appearance = this_floor = agreement.appearance(found.probability, weights)
     other_floors = weights.floor_odds[has_look_alikes] * (1.0 - this_floor)
     probability = found.probability * this_floor / (this_floor + other_floors)
-    return replace(found, appearance=appearance, probability=probability)
+    found = replace(found, appearance=appearance, probability=probability)
+    return found, [(found, points) for _, points in named]

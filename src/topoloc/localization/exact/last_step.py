@@ -64,12 +64,7 @@ def make_precise(
     """
     if not has_prior:
         outcome = _reconsider_refusal(searches, outcome)
-    result, named = _refine_result(searches, outcome)
-    if isinstance(result, Localization):
-        with searches[0].query.clock.stage("appearance"):
-            result = weigh_appearance(searches[0], result)
-        return result, [(result, points) for _, points in named]
-    return result, named
+    return weigh_appearance(searches[0], _refine_result(searches, outcome))
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:

@@ -169,8 +169,9 @@ def sample_colours(
     """Return the small colours at pixels of the whole image, interpolated bilinearly."""
     scales = np.array([colours.shape[1] / camera.width, colours.shape[0] / camera.height])
     at = ((points_img + 0.5) * scales - 0.5).astype(np.float32)
-    mode = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
-    return cv2.remap(colours, at[:, :1], at[:, 1:], **mode).reshape(-1, 3).astype(np.float64)
+    edge = cv2.BORDER_REPLICATE
+    sampled = cv2.remap(colours, at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=edge)
+    return sampled.reshape(-1, 3).astype(np.float64)
 
 
 def align(
