@@ -39,9 +39,9 @@ class FloorEvidence:
     def is_sure(self) -> bool:
         """Return whether the places so far are of this floor. Three places must say so more
         clearly. In a map with look-alike floors fewer do not suffice."""
-        is_enough = len(self._seen) >= 3
-        least = math.log(load_appearance_weights().floor_odds[self._has_look_alikes])
-        least += 3.0 if is_enough else 0.0
+        weights, is_enough = load_appearance_weights(), len(self._seen) >= 3
+        least = math.log(weights.floor_odds[self._has_look_alikes])
+        least += weights.places_log_odds if is_enough else 0.0
         seen = sum(log_odds for _, log_odds in self._seen)
         return seen >= least and (is_enough or not self._has_look_alikes)
 

@@ -39,7 +39,8 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
       times the standard deviation of the change of brightness, and `bias`. Log-odds of the pose
       above `clear_log_odds` are added: a room may have been painted.
     - `floor_odds`: how likely an image is of another floor, relative to this one, in most maps and
-      in maps with look-alike floors.
+      in maps with look-alike floors. The log-odds of three places of a stream must exceed those
+      odds by `places_log_odds`.
     """
 
     corpus: str
@@ -56,6 +57,7 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     bias: Finite
     clear_log_odds: Finite
     floor_odds: tuple[Finite, Finite]
+    places_log_odds: Finite
 
 
 @cache
