@@ -19,8 +19,8 @@ from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoFrame, to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.tracking.floor_evidence import FloorEvidence
 from topoloc.tracking.tracker import Tracker
+from topoloc.tracking.tracker_state import FloorEvidence
 
 
 @once_a_run

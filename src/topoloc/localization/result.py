@@ -86,9 +86,8 @@ class Localization(_Result):
             include it.
         seen_camera: calibration estimate of this image (`geometry/calibration_check.py`), or None.
         geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
-        appearance: probability that all points in view have the colours of the map rather than
-            those of another floor of the building, if both floors were as likely. The probability
-            includes it. None if the image or the map is grey.
+        appearance: probability that the colours in view are this floor's and not another's, if both
+            were as likely. The probability includes it. None if the image or the map is grey.
     """
 
     world_from_cam: Rigid3
@@ -140,8 +139,7 @@ class Localization(_Result):
 
     @property
     def camera_covariance(self) -> Float[np.ndarray, "6 6"]:
-        """Return `covariance` in the camera frame: that of xi in ``true_world_from_cam =
-        world_from_cam @ exp(xi)``."""
+        """Return that of xi in ``true_world_from_cam = world_from_cam @ exp(xi)``."""
         return self.world_from_cam.inverse().transform_covariance(self.covariance)
 
     @property
@@ -159,7 +157,6 @@ class Localization(_Result):
             "frame_rotation_deg": self.frame_rotation_deg,
             "calibration_doubt": self.calibration_doubt and self.calibration_doubt.to_json(),
             "geopose": self.geopose and self.geopose.to_json(),
-            "appearance": self.appearance,
         }
         return {
             "query": query,
@@ -204,9 +201,7 @@ class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "no
 class NotLocalized(_Result):
     """Report that no pose is certain enough, with the `reason`.
 
-    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first. `appearance`
-    is that of a pose that was refused for it.
-    """
+    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first."""
 
     reason: Reason
     candidates: list[CandidateNode] = field(default_factory=list)
@@ -234,8 +229,7 @@ class NotLocalized(_Result):
         """Return one line of the result file, see docs/cli.md."""
         alternatives = [one.to_json() for one in self.alternatives]
         refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail}
-        seen = {} if self.appearance is None else {"appearance": self.appearance}
-        return refusal | {"alternatives": alternatives} | seen | _evidence_json(self)
+        return refusal | {"alternatives": alternatives} | _evidence_json(self)
 
 
 R = TypeVar("R", bound=Localization | NotLocalized)
@@ -263,6 +257,7 @@ def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
         "num_matches": result.num_matches,
         "num_inliers": result.num_inliers,
         "times_ms": {stage: round(ms, 3) for stage, ms in result.times_ms.items()},
+        **({} if result.appearance is None else {"appearance": result.appearance}),
         **result.provenance.to_json(),
     }
 
@@ -275,6 +270,7 @@ class _Line(Struct, frozen=True, kw_only=True, rename={"node_id": "node"}):
     num_matches: Count
     num_inliers: Count
     times_ms: dict[str, Finite]
+    appearance: Share | None = None
 
 
 class _LocalizedLine(_Line, frozen=True, kw_only=True):
@@ -289,7 +285,6 @@ class _LocalizedLine(_Line, frozen=True, kw_only=True):
     geopose: GeoPose | None = None
     frame_rotation_deg: NonNegative | None = None
     calibration_doubt: CalibrationMismatch | None = None
-    appearance: Share | None = None
 
     def __post_init__(self) -> None:
         diagonal = np.diag(self.covariance)
@@ -302,4 +297,3 @@ class _RefusedLine(_Line, frozen=True, kw_only=True):
     reason: Reason
     detail: str = ""
     alternatives: Annotated[tuple[Alternative, ...], Meta(max_length=10_000)] = ()
-    appearance: Share | None = None

@@ -31,7 +31,6 @@ from topoloc.recordings.frame import to_grey
 from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
-from topoloc.tracking.floor_evidence import FloorEvidence
 from topoloc.tracking.motion import Hypothesis, MotionState, update_motion
 from topoloc.tracking.point_tracker import PointTracker
 from topoloc.tracking.pose_hypotheses import PoseHypotheses
@@ -43,6 +42,7 @@ from topoloc.tracking.stream_localizer import (
 )
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker_state import (
+    FloorEvidence,
     PoseWindow,
     ReferenceImage,
     StreamFrame,
@@ -96,9 +96,8 @@ class MapStream:
         return self._complete_result(self._make_predicted_pose(result, t_ns))
 
     def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
-        return replace(
-            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
-        )
+        result = self.localizer.with_provenance(answer.result, camera, answer.t_ns)
+        return replace(answer, result=result)
 
     def _process_paper_mode(self, result: Localization | NotLocalized, t_ns: int) -> StreamedPose:
         """Apply section III-B to one result: "when such a jump is found, we copy the previous pose
@@ -132,9 +131,8 @@ class MapStream:
             self._drop_stale_reference()
             self._floor.add(found.result if isinstance(found, LocalizedPose) else found)
             if isinstance(found, LocalizedPose):
-                return self._mark_if_ambiguous(
-                    self._update_with_localization(frame, found, predicted, tracked, seconds)
-                )
+                known = predicted, tracked, seconds
+                return self._mark_if_ambiguous(self._update_with_localization(frame, found, *known))
             if tracked is None or self._reference is None:
                 return self._make_predicted_pose(found, frame.t_ns)
         return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked, clock))

@@ -1,9 +1,9 @@
 """Compare the colours in view with those of the map, because floors of a building look alike.
 
 They share walls, lamps and doors, so a pose on another floor has as many inliers as a right one.
-Paint, posters and furniture differ. Points of all nodes near the pose are compared, not only the
-inliers, which agree by their choice. Another light multiplies the colours by factors that vary
-slowly over the image. So the comparison is of logarithms, less a quadratic function of the pixel.
+Paint, posters and furniture differ. All points in view are compared, because inliers agree by their
+choice. Another light multiplies colours by factors that vary slowly over the image. So logarithms
+are correlated, less a quadratic function of the pixel.
 """
 
 from __future__ import annotations
@@ -29,18 +29,16 @@ from topoloc.node_ids import NodeId
 
 
 class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the weights of the appearance, fitted to images of this floor and of other ones.
+    """Hold the fitted weights of the appearance.
 
-    - Points of `num_nodes` nodes are compared, at least `min_points`. In each of `parts` (columns,
-      rows) of the image, points beyond `max_depth` times the nearer ones are hidden.
-    - Colours farther than `max_contrast` (in logarithms) from their median count as that far.
-      `noise` is the standard deviation of colours that say nothing, such as those of white walls.
+    - At least `min_points` points of `num_nodes` nodes are compared. In each of `parts` (columns,
+      rows) of the image, points beyond `max_depth` times the nearer ones are hidden. Logarithms of
+      colours are at most `max_contrast` from their median. A spread below `noise` says little.
     - The log-odds are `agreement` times the inverse hyperbolic tangent of the correlation, `light`
       times the standard deviation of the change of brightness, and `bias`. Log-odds of the pose
       above `clear_log_odds` are added: a room may have been painted.
-    - `floor_odds`: how likely an image is of another floor, relative to this one, in most maps and
-      in maps with look-alike floors. The log-odds of three places of a stream must exceed those
-      odds by `places_log_odds`.
+    - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. Three
+      places of a stream must exceed them by `places_log_odds`.
     """
 
     corpus: str
@@ -87,35 +85,34 @@ class ColourAgreement:
 
 
 def compare_colours(search: Search, found: Localization) -> ColourAgreement | None:
-    """Compare the colours of the points in view. None: an image is grey, or shows few
-    points of the map."""
-    weights, query = load_appearance_weights(), search.query
-    in_query = small_colours(query.image)
+    """Compare the colours of the points in view. None: an image is grey, or few points are."""
+    weights, query, topomap = load_appearance_weights(), search.query, search.map.topomap
+    camera, in_query = query.camera, small_colours(query.image)
     if in_query is None:
         return None
     # the nodes near a pose beside a bend look past its walls; those of its inliers do not
-    topomap, camera = search.map.topomap, query.camera
     seen_from = topomap.summaries[topomap.row_of(found.node_id)].world_from_cam
     points = search.map.local_map(search.map.nearest(seen_from, weights.num_nodes))
     cam_from_world = found.world_from_cam.inverse()
     rows, pixels = select_visible_points(points, cam_from_world, camera)
-    size = np.array([camera.width, camera.height])
+    places = pixels / [camera.width, camera.height]
     depths = cam_from_world.apply(points.points_world[rows])[:, 2]
-    shown = np.flatnonzero(_is_shown(pixels / size, depths, weights))
-    sampled = shown[sample_rows(len(shown))] if len(shown) else shown
-    rows, pixels, of_map = rows[sampled], pixels[sampled], np.full((len(sampled), 3), np.nan)
-    for node_id in np.unique(points.node_ids[rows]):
-        template = search.template(NodeId(int(node_id)))
-        if template.colours is not None:
-            of_node = points.node_ids[rows] == node_id
-            in_node = template.world_from_cam.inverse().apply(points.points_world[rows[of_node]])
-            at = template.camera.img_from_cam(in_node)
-            of_map[of_node] = sample_colours(template.colours, at, template.camera)
+    shown = np.flatnonzero(_is_shown(places, depths, weights))
+    if len(shown) < weights.min_points:
+        return None
+    sampled = shown[sample_rows(len(shown))]
+    positions, node_ids = points.points_world[rows[sampled]], points.node_ids[rows[sampled]]
+    of_query, of_map = sample_colours(in_query, places[sampled]), np.full((len(sampled), 3), np.nan)
+    for node_id in np.unique(node_ids):
+        node, of_node = search.template(NodeId(int(node_id))), node_ids == node_id
+        if node.colours is not None:
+            at = node.camera.img_from_cam(node.world_from_cam.inverse().apply(positions[of_node]))
+            size = [node.camera.width, node.camera.height]
+            of_map[of_node] = sample_colours(node.colours, at / size)
     known = np.isfinite(of_map[:, 0])
     if np.count_nonzero(known) < weights.min_points:
         return None
-    of_query = sample_colours(in_query, pixels[known], camera)
-    return _correlate(of_query, of_map[known], pixels[known] / size, weights)
+    return _correlate(of_query[known], of_map[known], places[sampled][known], weights)
 
 
 def _is_shown(
@@ -125,11 +122,10 @@ def _is_shown(
     counts = np.array(weights.parts)
     columns, rows = np.clip(places * counts, 0, counts - 1).astype(int).T
     part = rows * counts[0] + columns
-    order = np.lexsort((depths, part))
     numbers = np.bincount(part, minlength=int(counts.prod()))
-    near_share = 0.2  # points that are nearer belong to thin things
-    nearer = np.cumsum(numbers) - numbers + (near_share * numbers).astype(int)
-    return depths <= weights.max_depth * depths[order[np.minimum(nearer, len(order) - 1)]][part]
+    thin_share = 0.2  # nearer points belong to thin things
+    ranks = np.cumsum(numbers) - numbers + (thin_share * numbers).astype(int)
+    return depths <= weights.max_depth * depths[np.lexsort((depths, part))[ranks[part]]]
 
 
 def _correlate(
@@ -138,7 +134,7 @@ def _correlate(
     places: Float[np.ndarray, "n 2"],
     weights: AppearanceWeights,
 ) -> ColourAgreement:
-    """Correlate colours, given as brightness, red over green and blue over yellow."""
+    """Correlate `small_colours`."""
     x, y = (2.0 * places - 1.0).T
     slow = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     both = np.column_stack([of_query[:, 1:], of_map[:, 1:]])
@@ -159,20 +155,21 @@ def weigh_appearance(search: Search, outcome: ResultWithInliers) -> ResultWithIn
     Without colours nothing tells floors apart, and a map with look-alike floors is honest about it.
     """
     found, named = outcome
-    if not isinstance(found, Localization):
+    if not isinstance(found, Localization) or not search.query.grey.any():  # only features
         return outcome
-    weights, has_look_alikes = (
-        load_appearance_weights(),
-        search.map.topomap.config.look_alike_floors,
-    )
     with search.query.clock.stage("appearance"):
         agreement = compare_colours(search, found) if found.is_of_nodes else None
-    if agreement is None and not has_look_alikes:
-        return outcome
-    appearance, this_floor = None, 0.5
+    weights, appearance = load_appearance_weights(), None
     if agreement is not None:
-        appearance = this_floor = agreement.appearance(found.probability, weights)
-    other_floors = weights.floor_odds[has_look_alikes] * (1.0 - this_floor)
-    probability = found.probability * this_floor / (this_floor + other_floors)
-    found = replace(found, appearance=appearance, probability=probability)
+        appearance = agreement.appearance(found.probability, weights)
+    share = share_of_this_floor(appearance, search.map.topomap.config.look_alike_floors)
+    found = replace(found, appearance=appearance, probability=share * found.probability)
     return found, [(found, points) for _, points in named]
+
+
+def share_of_this_floor(appearance: float | None, has_look_alikes: bool) -> float:
+    """Return the factor of the probability that follows from the appearance."""
+    if appearance is None:
+        appearance = 0.5 if has_look_alikes else 1.0
+    others = load_appearance_weights().floor_odds[has_look_alikes] * (1.0 - appearance)
+    return appearance / max(appearance + others, 1e-9)

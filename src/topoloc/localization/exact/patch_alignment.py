@@ -162,15 +162,11 @@ def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
 
 
 def sample_colours(
-    colours: Float[np.ndarray, "rows columns 3"],
-    points_img: Float[np.ndarray, "n 2"],
-    camera: Camera,
+    colours: Float[np.ndarray, "rows columns 3"], places: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the small colours at pixels of the whole image, interpolated bilinearly."""
-    scales = np.array([colours.shape[1] / camera.width, colours.shape[0] / camera.height])
-    at = ((points_img + 0.5) * scales - 0.5).astype(np.float32)
-    edge = cv2.BORDER_REPLICATE
-    sampled = cv2.remap(colours, at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=edge)
+    """Return the colours at places, which are pixels over the image size."""
+    x, y = (places * colours.shape[1::-1] - 0.5).astype(np.float32).T[:, :, None]
+    sampled = cv2.remap(colours, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return sampled.reshape(-1, 3).astype(np.float64)
 
 
