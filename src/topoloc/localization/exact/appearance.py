@@ -36,7 +36,7 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
       colours are at most `max_contrast` from their median. A spread below `noise` says little.
     - The log-odds are `agreement` times the inverse hyperbolic tangent of the correlation, `light`
       times the standard deviation of the change of brightness, and `bias`. Log-odds of the pose
-      above `clear_log_odds` are added: a room may have been painted.
+      above the first of `clear_log_odds`, times the second, are added: a room may be painted anew.
     - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. Three
       places of a stream must exceed them by `places_log_odds`.
     """
@@ -53,7 +53,7 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     agreement: Finite
     light: Finite
     bias: Finite
-    clear_log_odds: Finite
+    clear_log_odds: tuple[Finite, Finite]
     floor_odds: tuple[Finite, Finite]
     places_log_odds: Finite
 
@@ -80,7 +80,8 @@ class ColourAgreement:
         log_odds = weights.agreement * math.atanh(correlation) + weights.light * self.light_change
         share = self.contrast**2 / (self.contrast**2 + weights.noise**2)
         known = min(max(probability, 0.5), 0.9999)
-        clear = max(0.0, math.log(known / (1.0 - known)) - weights.clear_log_odds)
+        least, slope = weights.clear_log_odds
+        clear = slope * max(0.0, math.log(known / (1.0 - known)) - least)
         return 1.0 / (1.0 + math.exp(-share * (log_odds + weights.bias) - clear))
 
 
@@ -133,8 +134,8 @@ def _correlate(
     of_map: Float[np.ndarray, "n 3"],
     places: Float[np.ndarray, "n 2"],
     weights: AppearanceWeights,
-) -> ColourAgreement:
-    """Correlate `small_colours`."""
+) -> ColourAgreement | None:
+    """Correlate `small_colours`. None: the image or the map is grey."""
     x, y = (2.0 * places - 1.0).T
     slow = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     both = np.column_stack([of_query[:, 1:], of_map[:, 1:]])
@@ -143,10 +144,11 @@ def _correlate(
     products = np.mean(colours[:, :2] * colours[:, 2:], axis=0)
     variances = np.mean(colours**2, axis=0).reshape(2, 2)
     least_variance = 1e-4  # of the noise of pixels
-    correlations = products / np.sqrt((variances + least_variance).prod(axis=0))
+    correlation = (products / np.sqrt((variances + least_variance).prod(axis=0))).mean()
     light_change = float(np.std(of_query[:, 0] - of_map[:, 0]))
-    contrast = math.sqrt(variances.mean(axis=1).min())  # a grey image says nothing
-    return ColourAgreement(float(correlations.mean()), light_change, contrast)
+    contrast = math.sqrt(variances.mean(axis=1).min())
+    is_grey = contrast < 0.2 * weights.noise
+    return None if is_grey else ColourAgreement(float(correlation), light_change, contrast)
 
 
 def weigh_appearance(search: Search, outcome: ResultWithInliers) -> ResultWithInliers:
