@@ -168,7 +168,7 @@ def _is_stream_answer(three: list[Row], odds: float, weights: AppearanceWeights)
         min(max(log, -4.0), 4.0) for row in three if (log := _log_odds(row, weights)) is not None
     ]
     is_enough = len(seen) == 3
-    least = math.log(odds) + (weights.places_log_odds if is_enough else 0.0)
+    least = math.log(odds) + (weights.places_log_odds[odds >= 1.0] if is_enough else 0.0)
     return is_one_way and (is_enough or odds < 1.0) and sum(seen) >= least
 
 

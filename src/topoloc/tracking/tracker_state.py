@@ -252,7 +252,7 @@ class FloorEvidence:
         three do not suffice."""
         weights, is_enough = load_appearance_weights(), len(self._seen) >= 3
         least = math.log(weights.floor_odds[self._has_look_alikes])
-        least += weights.places_log_odds if is_enough else 0.0
+        least += weights.places_log_odds[self._has_look_alikes] if is_enough else 0.0
         # a floor that resembles this one does so at many places, so more add no more than three
         seen = sum(log_odds for _, log_odds in self._seen) * 3.0 / max(3.0, len(self._seen))
         return seen >= least and (is_enough or not self._has_look_alikes)

@@ -37,8 +37,8 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     - The log-odds are `agreement` times the inverse hyperbolic tangent of the correlation, `light`
       times the standard deviation of the change of brightness, and `bias`. Log-odds of the pose
       above the first of `clear_log_odds`, times the second, are added: a room may be painted anew.
-    - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. Three
-      places of a stream must exceed them by `places_log_odds`.
+    - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. The
+      log-odds of three places of a stream must exceed theirs by `places_log_odds`.
     """
 
     corpus: str
@@ -55,7 +55,7 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     bias: Finite
     clear_log_odds: tuple[Finite, Finite]
     floor_odds: tuple[Finite, Finite]
-    places_log_odds: Finite
+    places_log_odds: tuple[Finite, Finite]
 
 
 @cache
