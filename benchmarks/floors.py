@@ -142,15 +142,16 @@ def count(groups: list[list[Row]], weights: AppearanceWeights) -> list[int]:
     ]
 
 
-def _log_odds(row: Row, weights: AppearanceWeights) -> float | None:
+def _log_odds(row: Row, odds: float, weights: AppearanceWeights) -> float | None:
     if "seen" not in row:
         return None
-    seen = ColourAgreement(*row["seen"]).appearance(row["p"], weights)
+    certainty = 0.0 if odds >= 1.0 else row["p"]  # as `weigh_appearance`
+    seen = ColourAgreement(*row["seen"]).appearance(certainty, weights)
     return math.log(seen / (1.0 - seen))
 
 
 def _is_answer(row: Row, odds: float, weights: AppearanceWeights) -> bool:
-    log_odds = _log_odds(row, weights)
+    log_odds = _log_odds(row, odds, weights)
     others = 0.0 if log_odds is None else odds * math.exp(-log_odds)
     return row.get("p", 0.0) / (1.0 + others) >= 0.5
 
@@ -165,7 +166,9 @@ def _is_stream_answer(three: list[Row], odds: float, weights: AppearanceWeights)
         np.linalg.norm(a.translation - b.translation) < 3.0 for a, b in pairwise(poses)
     )
     seen = [
-        min(max(log, -4.0), 4.0) for row in three if (log := _log_odds(row, weights)) is not None
+        min(max(log, -4.0), 4.0)
+        for row in three
+        if (log := _log_odds(row, odds, weights)) is not None
     ]
     is_enough = len(seen) == 3
     least = math.log(odds) + (weights.places_log_odds[odds >= 1.0] if is_enough else 0.0)

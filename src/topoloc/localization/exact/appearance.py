@@ -161,10 +161,12 @@ def weigh_appearance(search: Search, outcome: ResultWithInliers) -> ResultWithIn
         return outcome
     with search.query.clock.stage("appearance"):
         agreement = compare_colours(search, found) if found.is_of_nodes else None
-    weights, appearance = load_appearance_weights(), None
+    appearance, has_look_alikes = None, search.map.topomap.config.look_alike_floors
     if agreement is not None:
-        appearance = agreement.appearance(found.probability, weights)
-    share = share_of_this_floor(appearance, search.map.topomap.config.look_alike_floors)
+        # where floors look alike, a clear pose tells no floor
+        certainty = 0.0 if has_look_alikes else found.probability
+        appearance = agreement.appearance(certainty, load_appearance_weights())
+    share = share_of_this_floor(appearance, has_look_alikes)
     found = replace(found, appearance=appearance, probability=share * found.probability)
     return found, [(found, points) for _, points in named]
 
