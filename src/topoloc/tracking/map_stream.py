@@ -179,8 +179,7 @@ class MapStream:
 
     def _is_localization_due(self, tracked: TrackedImage, frame: StreamFrame) -> bool:
         """Return whether the image must be localized in full."""
-        # Minimum seconds between two full localizations while the points are tracked.
-        retry_interval = 0.1
+        retry_interval = 0.1  # least seconds between full localizations if points are tracked
         interval = 0.25  # interval of full localizations, seconds
         # or if the share of points still tracked is below this
         min_share_left = 0.6
@@ -285,6 +284,7 @@ class MapStream:
             num_inliers=tracked.motion.num_inliers,
             times_ms=clock.times_ms(),
             provenance=found.provenance,
+            appearance=found.appearance,
         )
         covariance = compute_smoothed_covariance(tracked.reference, state)
         return StreamedPose(frame.t_ns, "tracked", result, state.world_from_cam, covariance)
