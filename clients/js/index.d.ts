@@ -37,6 +37,8 @@ export interface Query {
   num_inliers: number;
   times_ms: Record<string, number>;
   /** Streams only, as the next three. */
+  /** Probability that the colours in view are this floor's and not another's, if both were as likely. */
+  appearance?: number;
   state?: "localized" | "tracked" | "predicted" | "ambiguous" | "lost";
   smoothed?: Pose | null;
   smoothed_covariance?: number[][] | null;

@@ -18,7 +18,7 @@ from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasureme
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Deadline, Query, QueryImage, StageClock, reduce_image
-from topoloc.localization.result import Localization, NotLocalized, R
+from topoloc.localization.result import Localization, NotLocalized, R, Reason
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
@@ -157,12 +157,20 @@ class MapContext:
         self, outcome: ResultWithInliers, camera: Camera | UncalibratedCamera
     ) -> ResultWithInliers:
         """Return a result and its poses `with_provenance`. A pose below the threshold of the map's
-        certificate is refused."""
+        certificate is refused, and one that looks as on another floor."""
         result, poses = outcome
         certified = self.topomap.certificate
         least = 0.0 if certified is None else certified.applied_min_probability
         if isinstance(result, Localization) and result.probability < least:
-            result, poses = _refuse(result, least), []
+            why = f"probability {result.probability:.3g}, below the map's certified threshold"
+            result, poses = _refuse(result, "too_few_inliers", f"{why} {least:.3g}"), []
+        elif (
+            isinstance(result, Localization)
+            and result.probability < self.config.evidence.min_probability
+        ):
+            seen = "there are none" if result.appearance is None else f"{result.appearance:.2g}"
+            why = "the shape agrees, but not the colours, as on another floor of the building"
+            result, poses = _refuse(result, "not_in_map", f"{why} (appearance: {seen})"), []
         return self.with_provenance(result, camera), [
             (self.with_provenance(one, camera), seen) for one, seen in poses
         ]
@@ -198,17 +206,18 @@ class MapContext:
         )
 
 
-def _refuse(result: Localization, least: float) -> NotLocalized:
-    """Return the refusal of a pose below the threshold of the map's certificate."""
+def _refuse(result: Localization, reason: Reason, detail: str) -> NotLocalized:
+    """Return the refusal of a pose."""
     return NotLocalized(
-        "too_few_inliers",
+        reason,
         result.candidates,
         result.num_matches,
         result.num_inliers,
         result.times_ms,
-        f"probability {result.probability:.3g}, below the map's certified threshold {least:.3g}",
+        detail,
         provenance=result.provenance,
         seen_camera=result.seen_camera,
+        appearance=result.appearance,
     )
 
 

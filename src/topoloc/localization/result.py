@@ -86,6 +86,8 @@ class Localization(_Result):
             include it.
         seen_camera: calibration estimate of this image (`geometry/calibration_check.py`), or None.
         geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
+        appearance: probability that the colours in view are this floor's and not another's, if both
+            were as likely. The probability includes it. None if the image or the map is grey.
     """
 
     world_from_cam: Rigid3
@@ -105,6 +107,7 @@ class Localization(_Result):
     frame_rotation_deg: float | None = None
     calibration_doubt: CalibrationMismatch | None = None
     seen_camera: IntrinsicsDeviation | None = None
+    appearance: float | None = None
 
     def __repr__(self) -> str:
         sigmas = f"{100 * self.position_sigma_m:.1f} cm, {self.rotation_sigma_deg:.2f} deg"
@@ -136,8 +139,7 @@ class Localization(_Result):
 
     @property
     def camera_covariance(self) -> Float[np.ndarray, "6 6"]:
-        """Return `covariance` in the camera frame: that of xi in ``true_world_from_cam =
-        world_from_cam @ exp(xi)``."""
+        """Return that of xi in ``true_world_from_cam = world_from_cam @ exp(xi)``."""
         return self.world_from_cam.inverse().transform_covariance(self.covariance)
 
     @property
@@ -199,8 +201,7 @@ class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "no
 class NotLocalized(_Result):
     """Report that no pose is certain enough, with the `reason`.
 
-    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first.
-    """
+    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first."""
 
     reason: Reason
     candidates: list[CandidateNode] = field(default_factory=list)
@@ -211,6 +212,7 @@ class NotLocalized(_Result):
     alternatives: tuple[Alternative, ...] = ()
     provenance: Provenance = EMPTY_PROVENANCE
     seen_camera: IntrinsicsDeviation | None = None
+    appearance: float | None = None
 
     def __repr__(self) -> str:
         text = ": ".join(filter(None, [self.reason, " ".join(self.detail.split())]))
@@ -255,6 +257,7 @@ def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
         "num_matches": result.num_matches,
         "num_inliers": result.num_inliers,
         "times_ms": {stage: round(ms, 3) for stage, ms in result.times_ms.items()},
+        **({} if result.appearance is None else {"appearance": result.appearance}),
         **result.provenance.to_json(),
     }
 
@@ -267,6 +270,7 @@ class _Line(Struct, frozen=True, kw_only=True, rename={"node_id": "node"}):
     num_matches: Count
     num_inliers: Count
     times_ms: dict[str, Finite]
+    appearance: Share | None = None
 
 
 class _LocalizedLine(_Line, frozen=True, kw_only=True):

@@ -54,6 +54,9 @@ class MapConfig(OneLine):
     uncertain. None: beside SURF, the default learned type."""
     vlad: VladConfig = field(default_factory=VladConfig)
     sides: VirtualNodesConfig = field(default_factory=VirtualNodesConfig)
+    look_alike_floors: bool = False
+    """The building has other floors like this one that the map does not hold. A pose is then given
+    only if the colours agree."""
 
     @property
     def kinds(self) -> list[str]:

@@ -42,6 +42,7 @@ from topoloc.tracking.stream_localizer import (
 )
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker_state import (
+    FloorEvidence,
     PoseWindow,
     ReferenceImage,
     StreamFrame,
@@ -67,6 +68,7 @@ class MapStream:
         self._last_smoothed: Rigid3 | None = None
         self._reference: ReferenceImage | None = None
         self._last_attempt_ns = 0
+        self._floor = FloorEvidence(localizer.topomap.config.look_alike_floors)
 
     def process(
         self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None, limit: Deadline
@@ -94,9 +96,8 @@ class MapStream:
         return self._complete_result(self._make_predicted_pose(result, t_ns))
 
     def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
-        return replace(
-            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
-        )
+        result = self.localizer.with_provenance(answer.result, camera, answer.t_ns)
+        return replace(answer, result=result)
 
     def _process_paper_mode(self, result: Localization | NotLocalized, t_ns: int) -> StreamedPose:
         """Apply section III-B to one result: "when such a jump is found, we copy the previous pose
@@ -128,10 +129,10 @@ class MapStream:
             self._last_attempt_ns = frame.t_ns
             found = self._stream_localizer.localize(frame, self._predict_pose(predicted, tracked))
             self._drop_stale_reference()
+            self._floor.add(found.result if isinstance(found, LocalizedPose) else found)
             if isinstance(found, LocalizedPose):
-                return self._mark_if_ambiguous(
-                    self._update_with_localization(frame, found, predicted, tracked, seconds)
-                )
+                known = predicted, tracked, seconds
+                return self._mark_if_ambiguous(self._update_with_localization(frame, found, *known))
             if tracked is None or self._reference is None:
                 return self._make_predicted_pose(found, frame.t_ns)
         return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked, clock))
@@ -144,10 +145,12 @@ class MapStream:
 
     def _mark_if_ambiguous(self, answer: StreamedPose) -> StreamedPose:
         """Return the result unchanged if one hypothesis leads, and an ambiguous one otherwise."""
-        if self._hypotheses.is_unambiguous:
+        if self._hypotheses.is_unambiguous and self._floor.is_sure:
             return answer
         alternatives = self._hypotheses.alternatives()
         detail = "too little speaks for this pose so far"
+        if not self._floor.is_sure:
+            detail = "the colours so far leave open whether this is another floor of the building"
         if len(alternatives) > 1:
             detail = "the pictures so far leave open which of these"
         times_ms, provenance = answer.result.times_ms, answer.result.provenance
@@ -176,8 +179,7 @@ class MapStream:
 
     def _is_localization_due(self, tracked: TrackedImage, frame: StreamFrame) -> bool:
         """Return whether the image must be localized in full."""
-        # Minimum seconds between two full localizations while the points are tracked.
-        retry_interval = 0.1
+        retry_interval = 0.1  # least seconds between full localizations if points are tracked
         interval = 0.25  # interval of full localizations, seconds
         # or if the share of points still tracked is below this
         min_share_left = 0.6
@@ -282,6 +284,7 @@ class MapStream:
             num_inliers=tracked.motion.num_inliers,
             times_ms=clock.times_ms(),
             provenance=found.provenance,
+            appearance=found.appearance,
         )
         covariance = compute_smoothed_covariance(tracked.reference, state)
         return StreamedPose(frame.t_ns, "tracked", result, state.world_from_cam, covariance)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.exact.appearance import share_of_this_floor
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.query import QueryImage
@@ -56,6 +57,7 @@ class StreamLocalizer:
 
     def __init__(self, localizer: Localizer, hypotheses: PoseHypotheses) -> None:
         self._localizer, self._hypotheses = localizer, hypotheses
+        self._has_look_alikes = localizer.topomap.config.look_alike_floors
         self._last_ambiguous_pose: Rigid3 | None = None  # pose of the last ambiguous image
         self._has_prior = hypotheses.best is not None
 
@@ -148,7 +150,9 @@ class StreamLocalizer:
         for one, points in named:
             probability = one.probability
             if refusal is None:
-                probability = min(_place_probability(one), 1.0 - self._hypotheses.miss)
+                share = share_of_this_floor(one.appearance, self._has_look_alikes)
+                place = _place_probability(one) / max(share, 1e-9)  # the stream judges the floor
+                probability = min(place, 1.0 - self._hypotheses.miss)
             depths = one.world_from_cam.inverse().apply(points.points_world)[:, 2]
             errors = compute_pose_errors(one, float(np.median(depths)))
             found.append(LocalizedPose(one, points, errors, probability))

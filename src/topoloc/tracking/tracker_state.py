@@ -11,6 +11,7 @@ They differ by 2 (1 - exp(-s / reach)) of its covariance.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -19,8 +20,9 @@ from jaxtyping import Float, UInt8
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.exact.appearance import load_appearance_weights
 from topoloc.localization.query import Deadline
-from topoloc.localization.result import Localization
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.retrieval.coarse import Image
 from topoloc.slam.pose_graph import Edge, optimize_pose_graph
 from topoloc.tracking.motion import MotionState
@@ -215,3 +217,42 @@ class PoseWindow:
         )
         self._smoothed = deque(poses[1:], maxlen=self._smoothed.maxlen)
         return self._smoothed[-1], self._covariance
+
+
+class FloorEvidence:
+    """Hold the log-odds of the appearances at the last places of a stream.
+
+    One image may not tell floors apart. Images of other places are nearly independent, so their
+    log-odds add up.
+    """
+
+    def __init__(self, has_look_alikes: bool) -> None:
+        self._has_look_alikes = has_look_alikes
+        self._seen = list[tuple[Rigid3 | None, float]]()
+
+    def add(self, result: Localization | NotLocalized) -> None:
+        """Add an image, unless it is of the last place. Successive refusals are of one place."""
+        max_places, min_metres, min_radians, max_log_odds = 5, 0.5, 0.5, 4.0
+        pose = result.world_from_cam if isinstance(result, Localization) else None
+        is_known = False
+        if self._seen:
+            last = self._seen[-1][0]
+            is_known = last is pose  # both refused
+            if last is not None and pose is not None:
+                is_known = last.is_same(pose, min_metres, min_radians)
+        if result.appearance is not None and not is_known:
+            appearance = min(max(result.appearance, 1e-6), 1.0 - 1e-6)
+            log_odds = math.log(appearance / (1.0 - appearance))
+            log_odds = min(max(log_odds, -max_log_odds), max_log_odds)
+            self._seen = [*self._seen, (pose, log_odds)][-max_places:]
+
+    @property
+    def is_sure(self) -> bool:
+        """Return whether the places are of this floor. In a map with look-alike floors fewer than
+        three do not suffice."""
+        weights, is_enough = load_appearance_weights(), len(self._seen) >= 3
+        least = math.log(weights.floor_odds[self._has_look_alikes])
+        least += weights.places_log_odds[self._has_look_alikes] if is_enough else 0.0
+        # a floor that resembles this one does so at many places, so more add no more than three
+        seen = sum(log_odds for _, log_odds in self._seen) * 3.0 / max(3.0, len(self._seen))
+        return seen >= least and (is_enough or not self._has_look_alikes)

@@ -22,6 +22,7 @@ from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.exact.appearance import weigh_appearance
 from topoloc.localization.exact.patch_alignment import (
     LastStepWeights,
     PreciseMatches,
@@ -63,7 +64,7 @@ def make_precise(
     """
     if not has_prior:
         outcome = _reconsider_refusal(searches, outcome)
-    return _refine_result(searches, outcome)
+    return weigh_appearance(searches[0], _refine_result(searches, outcome))
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from msgspec import Struct
@@ -24,7 +25,7 @@ from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.mapping.topomap import TopoNode
 from topoloc.node_ids import NodeId
-from topoloc.recordings.frame import to_grey
+from topoloc.recordings.frame import Image, to_grey
 
 
 class CrowdingWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -126,12 +127,13 @@ def spread(matches: PreciseMatches, camera: Camera, max_number: int) -> PreciseM
 @dataclass(frozen=True, eq=False)
 class NodeTemplate:
     """Hold the image of a node. `camera` has the size of the image. An image that is missing or
-    damaged `is_black`."""
+    damaged `is_black`. `colours` are its `small_colours`."""
 
     image: UInt8[np.ndarray, "h w"]
     camera: Camera
     world_from_cam: Rigid3
     is_black: bool = False
+    colours: Float[np.ndarray, "rows columns 3"] | None = None
 
     @staticmethod
     def of_node(node: TopoNode) -> NodeTemplate:
@@ -142,7 +144,30 @@ class NodeTemplate:
             image = None
         grey = np.zeros((2, 2), np.uint8) if image is None else to_grey(image)
         camera = node.camera.rescaled(grey.shape[1], grey.shape[0])
-        return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None)
+        colours = None if image is None else small_colours(image)
+        return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None, colours)
+
+
+def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
+    """Return the logarithms of brightness, red over green and blue over yellow in 80 columns. None:
+    the image is grey."""
+    if image.ndim == 2:
+        return None
+    size = 80, max(1, round(80 * image.shape[0] / image.shape[1]))
+    darkest = 8.0  # levels below are noise
+    levels = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA) + np.float32(darkest))
+    red, green, blue = np.moveaxis(levels, 2, 0)
+    yellow = (red + green) / 2.0
+    return np.dstack([levels.mean(axis=2), red - green, blue - yellow]).astype(np.float32)
+
+
+def sample_colours(
+    colours: Float[np.ndarray, "rows columns 3"], places: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return the colours at places, which are pixels over the image size."""
+    x, y = (places * colours.shape[1::-1] - 0.5).astype(np.float32).T[:, :, None]
+    sampled = cv2.remap(colours, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(-1, 3).astype(np.float64)
 
 
 def align(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -88,6 +88,9 @@ class Command:
         float | None, option("M/RAD", "a node every 2 degrees", name="lambda")
     ] = None
     """Weight of rotation against translation (lambda of Eq. 1)."""
+    look_alike_floors: Flag = False
+    """The building has floors like this one that are not mapped: poses need the same colours, and
+    those of a stream three places with them."""
     level: Flag = False
     """Give the map a world with z up and the floor at z = 0, see `topoloc level`."""
     features: BUILD_FEATURES = None
@@ -135,6 +138,8 @@ class Command:
         config = settings.of(BuildConfig)
         config = with_option(config, "nodes.d_thresh", self.d_thresh, "--d-thresh")
         config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
+        if self.look_alike_floors:
+            config = replace(config, look_alike_floors=True)
         return MapJob(
             tuple(recordings),
             PoseOptions(self.trajectory, self.poses, self.scale, self.allow_gaps),

@@ -1,0 +1,179 @@
+"""Compare the colours in view with those of the map, because floors of a building look alike.
+
+They share walls, lamps and doors, so a pose on another floor has as many inliers as a right one.
+Paint, posters and furniture differ. All points in view are compared, because inliers agree by their
+choice. Another light multiplies colours by factors that vary slowly over the image. So logarithms
+are correlated, less a quadratic function of the pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from msgspec import Struct
+
+from topoloc.errors import FeatureTypeError
+from topoloc.json_data import Finite, decode_json
+from topoloc.localization.evidence import sample_rows
+from topoloc.localization.exact.patch_alignment import sample_colours, small_colours
+from topoloc.localization.guided import select_visible_points
+from topoloc.localization.result import Localization
+from topoloc.localization.result_decision import ResultWithInliers
+from topoloc.localization.search import Search
+from topoloc.node_ids import NodeId
+
+
+class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the fitted weights of the appearance.
+
+    - At least `min_points` points of `num_nodes` nodes are compared. In each of `parts` (columns,
+      rows) of the image, points beyond `max_depth` times the nearer ones are hidden. Logarithms of
+      colours are at most `max_contrast` from their median. A spread below `noise` says little.
+    - The log-odds are `agreement` times the inverse hyperbolic tangent of the correlation, `light`
+      times the standard deviation of the change of brightness, and `bias`. Log-odds of the pose
+      above the first of `clear_log_odds`, times the second, are added: a room may be painted anew.
+    - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. The
+      log-odds of three places of a stream must exceed theirs by `places_log_odds`.
+    """
+
+    corpus: str
+    date: str
+    command: str
+    num_nodes: int
+    min_points: int
+    parts: tuple[int, int]
+    max_depth: Finite
+    max_contrast: Finite
+    noise: Finite
+    agreement: Finite
+    light: Finite
+    bias: Finite
+    clear_log_odds: tuple[Finite, Finite]
+    floor_odds: tuple[Finite, Finite]
+    places_log_odds: tuple[Finite, Finite]
+
+
+@cache
+def load_appearance_weights() -> AppearanceWeights:
+    """Return the shipped weights. Raises FeatureTypeError: the file is damaged."""
+    path = Path(__file__).parent / "appearance.json"
+    return decode_json(path.read_bytes(), AppearanceWeights, FeatureTypeError, str(path))
+
+
+@dataclass(frozen=True)
+class ColourAgreement:
+    """Hold the correlation of the colours, -1 to 1, the standard deviation of the change of
+    brightness, and that of the colours where it is less: in the image or in the map."""
+
+    correlation: float
+    light_change: float
+    contrast: float
+
+    def appearance(self, probability: float, weights: AppearanceWeights) -> float:
+        """Return `Localization.appearance` of a pose with this probability without it."""
+        correlation = min(max(self.correlation, -0.97), 0.97)
+        log_odds = weights.agreement * math.atanh(correlation) + weights.light * self.light_change
+        share = self.contrast**2 / (self.contrast**2 + weights.noise**2)
+        known = min(max(probability, 0.5), 0.9999)
+        least, slope = weights.clear_log_odds
+        clear = slope * max(0.0, math.log(known / (1.0 - known)) - least)
+        return 1.0 / (1.0 + math.exp(-share * (log_odds + weights.bias) - clear))
+
+
+def compare_colours(search: Search, found: Localization) -> ColourAgreement | None:
+    """Compare the colours of the points in view. None: an image is grey, or few points are."""
+    weights, query, topomap = load_appearance_weights(), search.query, search.map.topomap
+    camera, in_query = query.camera, small_colours(query.image)
+    if in_query is None:
+        return None
+    # the nodes near a pose beside a bend look past its walls; those of its inliers do not
+    seen_from = topomap.summaries[topomap.row_of(found.node_id)].world_from_cam
+    points = search.map.local_map(search.map.nearest(seen_from, weights.num_nodes))
+    cam_from_world = found.world_from_cam.inverse()
+    rows, pixels = select_visible_points(points, cam_from_world, camera)
+    places = pixels / [camera.width, camera.height]
+    depths = cam_from_world.apply(points.points_world[rows])[:, 2]
+    shown = np.flatnonzero(_is_shown(places, depths, weights))
+    if len(shown) < weights.min_points:
+        return None
+    sampled = shown[sample_rows(len(shown))]
+    positions, node_ids = points.points_world[rows[sampled]], points.node_ids[rows[sampled]]
+    of_query, of_map = sample_colours(in_query, places[sampled]), np.full((len(sampled), 3), np.nan)
+    for node_id in np.unique(node_ids):
+        node, of_node = search.template(NodeId(int(node_id))), node_ids == node_id
+        if node.colours is not None:
+            at = node.camera.img_from_cam(node.world_from_cam.inverse().apply(positions[of_node]))
+            size = [node.camera.width, node.camera.height]
+            of_map[of_node] = sample_colours(node.colours, at / size)
+    known = np.isfinite(of_map[:, 0])
+    if np.count_nonzero(known) < weights.min_points:
+        return None
+    return _correlate(of_query[known], of_map[known], places[sampled][known], weights)
+
+
+def _is_shown(
+    places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, " n"], weights: AppearanceWeights
+) -> Bool[np.ndarray, " n"]:
+    """Return which points are not hidden by nearer ones. Places are pixels over the image size."""
+    counts = np.array(weights.parts)
+    columns, rows = np.clip(places * counts, 0, counts - 1).astype(int).T
+    part = rows * counts[0] + columns
+    numbers = np.bincount(part, minlength=int(counts.prod()))
+    thin_share = 0.2  # nearer points belong to thin things
+    ranks = np.cumsum(numbers) - numbers + (thin_share * numbers).astype(int)
+    return depths <= weights.max_depth * depths[np.lexsort((depths, part))[ranks[part]]]
+
+
+def _correlate(
+    of_query: Float[np.ndarray, "n 3"],
+    of_map: Float[np.ndarray, "n 3"],
+    places: Float[np.ndarray, "n 2"],
+    weights: AppearanceWeights,
+) -> ColourAgreement | None:
+    """Correlate `small_colours`. None: the image or the map is grey."""
+    x, y = (2.0 * places - 1.0).T
+    slow = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    both = np.column_stack([of_query[:, 1:], of_map[:, 1:]])
+    colours = np.clip(both - np.median(both, axis=0), -weights.max_contrast, weights.max_contrast)
+    colours -= slow @ np.linalg.lstsq(slow, colours, rcond=None)[0]
+    products = np.mean(colours[:, :2] * colours[:, 2:], axis=0)
+    variances = np.mean(colours**2, axis=0).reshape(2, 2)
+    least_variance = 1e-4  # of the noise of pixels
+    correlation = (products / np.sqrt((variances + least_variance).prod(axis=0))).mean()
+    light_change = float(np.std(of_query[:, 0] - of_map[:, 0]))
+    contrast = math.sqrt(variances.mean(axis=1).min())
+    is_grey = contrast < 0.2 * weights.noise
+    return None if is_grey else ColourAgreement(float(correlation), light_change, contrast)
+
+
+def weigh_appearance(search: Search, outcome: ResultWithInliers) -> ResultWithInliers:
+    """Return the outcome with the appearance of its pose, which the probability includes.
+
+    Without colours nothing tells floors apart, and a map with look-alike floors is honest about it.
+    """
+    found, named = outcome
+    if not isinstance(found, Localization) or not search.query.grey.any():  # only features
+        return outcome
+    with search.query.clock.stage("appearance"):
+        agreement = compare_colours(search, found) if found.is_of_nodes else None
+    appearance, has_look_alikes = None, search.map.topomap.config.look_alike_floors
+    if agreement is not None:
+        # where floors look alike, a clear pose tells no floor
+        certainty = 0.0 if has_look_alikes else found.probability
+        appearance = agreement.appearance(certainty, load_appearance_weights())
+    share = share_of_this_floor(appearance, has_look_alikes)
+    found = replace(found, appearance=appearance, probability=share * found.probability)
+    return found, [(found, points) for _, points in named]
+
+
+def share_of_this_floor(appearance: float | None, has_look_alikes: bool) -> float:
+    """Return the factor of the probability that follows from the appearance."""
+    if appearance is None:
+        appearance = 0.5 if has_look_alikes else 1.0
+    others = load_appearance_weights().floor_odds[has_look_alikes] * (1.0 - appearance)
+    return appearance / max(appearance + others, 1e-9)

@@ -1,0 +1,140 @@
+"""The colours of all points in view tell another floor of a building from this one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from made_once import once_a_run
+from topoloc.apps.cli import main
+from topoloc.demo.recordings import SHIPPED
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import StereoFrame, to_grey
+from topoloc.recordings.open import open_sequence
+from topoloc.tracking.tracker import Tracker
+from topoloc.tracking.tracker_state import FloorEvidence
+
+
+@once_a_run
+def built_lab() -> TopoMetricMap:
+    """A map of every second frame of a part of the demo's lab, of SURF alone."""
+    return build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@0:16:2"), BuildConfig(other_kinds=()))
+
+
+@pytest.fixture(scope="module")
+def lab() -> TopoMetricMap:
+    return built_lab()
+
+
+def _with_look_alikes(lab: TopoMetricMap) -> TopoMetricMap:
+    return replace(lab, config=replace(lab.config, look_alike_floors=True))
+
+
+def _unseen() -> list[StereoFrame]:
+    sequence = open_sequence(f"{SHIPPED / 'map_lap1'}@1:16:2")
+    return [sequence[index] for index in range(len(sequence))]
+
+
+def _painted(image: np.ndarray) -> np.ndarray:
+    """The image with other paint: the colours of each square are exchanged, brightness stays."""
+    painted = image.copy()
+    for number, (row, column) in enumerate(np.ndindex(6, 10)):
+        cell = np.s_[row * 80 : row * 80 + 80, column * 80 : column * 80 + 80]
+        painted[cell] = np.roll(image[cell], number % 3, axis=2)
+    grey, of_painted = (to_grey(one).astype(float)[..., None] for one in (image, painted))
+    return np.clip(painted * (grey + 1.0) / (of_painted + 1.0), 0, 255).astype(np.uint8)
+
+
+def _ask(lab: TopoMetricMap, images: list[np.ndarray]) -> list[Localization | NotLocalized]:
+    localizer, camera = Localizer(lab), _unseen()[0].camera
+    return [localizer.localize(image, camera) for image in images]
+
+
+def test_an_image_of_the_mapped_colours_keeps_its_probability_and_names_its_appearance(
+    lab: TopoMetricMap,
+):
+    for found in _ask(lab, [frame.image for frame in _unseen()[:3]]):
+        assert isinstance(found, Localization)
+        assert found.appearance is not None
+        assert found.appearance > 0.99
+        assert found.probability > 0.99
+        line = json.dumps(found.to_json("day.jpg"))
+        assert Localization.from_json(line).appearance == found.appearance
+
+
+def test_a_painted_room_looks_less_like_the_map_and_is_recognised_if_the_pose_is_clear(
+    lab: TopoMetricMap,
+):
+    image, half = _unseen()[0].image, _unseen()[0].image.copy()
+    middle = image.shape[1] // 2
+    half[:, middle:] = _painted(image)[:, middle:]
+    same, partly, all_over = (
+        found.appearance for found in _ask(lab, [image, half, _painted(image)])
+    )
+    assert None not in (same, partly, all_over)
+    assert (all_over or 0.0) < (partly or 0.0) < (same or 0.0)
+    assert all(isinstance(found, Localization) for found in _ask(lab, [half, _painted(image)]))
+
+
+def test_a_map_with_look_alike_floors_refuses_other_colours_and_images_without_any(
+    lab: TopoMetricMap,
+):
+    image = _unseen()[0].image
+    right, painted, grey = _ask(_with_look_alikes(lab), [image, _painted(image), to_grey(image)])
+    assert isinstance(right, Localization)
+    assert right.probability > 0.9
+    assert isinstance(painted, NotLocalized)
+    assert painted.reason == "not_in_map"
+    assert "another floor" in painted.detail
+    assert painted.appearance is not None
+    assert painted.appearance < 0.5
+    assert NotLocalized.from_json(painted.to_json("x")).appearance == painted.appearance
+    assert isinstance(grey, NotLocalized)
+    assert "(appearance: there are none)" in grey.detail
+    assert isinstance(_ask(lab, [to_grey(image)])[0], Localization)
+
+
+def test_a_stream_in_a_map_with_look_alike_floors_is_sure_after_three_places(lab: TopoMetricMap):
+    frames = _unseen()
+    for topomap, num_waiting in ((lab, 0), (_with_look_alikes(lab), 4)):
+        tracker, states = Tracker(Localizer(topomap)), list[str]()
+        for number, frame in enumerate(frames):
+            answer = tracker.process(frame.image, frame.camera, number * 2_000_000_000)
+            states.append(answer.state)
+        tracker.close()
+        assert states[:num_waiting] == ["ambiguous"] * num_waiting  # the first 1.4 m
+        assert states[num_waiting:] == ["localized"] * (len(frames) - num_waiting)
+
+
+def test_the_floor_is_judged_by_places_and_not_by_images(lab: TopoMetricMap):
+    first, *others = _ask(lab, [frame.image for frame in _unseen()[::2]])
+    assert isinstance(first, Localization)
+    evidence, usual = FloorEvidence(has_look_alikes=True), FloorEvidence(has_look_alikes=False)
+    for _ in range(5):
+        evidence.add(first)
+        usual.add(replace(first, appearance=0.1))
+    assert not evidence.is_sure
+    assert usual.is_sure
+    for other in others:
+        evidence.add(other)
+        usual.add(replace(other, appearance=0.1))
+    assert evidence.is_sure
+    assert not usual.is_sure
+
+
+def test_the_setting_is_an_option_of_build_and_stays_in_the_map(tmp_path: Path):
+    plain, strict = tmp_path / "plain.topo", tmp_path / "strict.topo"
+    recording = f"{SHIPPED / 'map_lap1'}@0:4:2"
+    assert main(["build", recording, str(plain), "--features", "surf"]) == 0
+    options = ["--features", "surf", "--look-alike-floors"]
+    assert main(["build", recording, str(strict), *options]) == 0
+    stored = [TopoMetricMap.load(path).config.look_alike_floors for path in (plain, strict)]
+    assert stored == [False, True]
