@@ -16,6 +16,7 @@ from topoloc.errors import MissingExtraError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import position_covariance
+from topoloc.lifelong.map_depth import MapPointLocator
 from topoloc.lifelong.session_poses import SessionPoses
 from topoloc.localization.result import Localization
 from topoloc.mapping.config import Progress
@@ -126,7 +127,7 @@ def create_session_content(
     by_index = {frame.index: frame for frame in frames}
     queried = {by_index[k]: one for k, one in session_poses.answers.items() if k in by_index}
     weak = [f for f, answer in queried.items() if not is_well_localized(answer, config.d_thresh)]
-    drafts = _draft_nodes(topomap, PointLocator(frames, config), weak, progress)
+    drafts = _draft_nodes(topomap, MapPointLocator(frames, topomap), weak, progress)
     drafted = {draft.frame: draft.image for draft in drafts}
     covered = queried.keys() - drafted.keys()
     new = NodePoses.of([image.world_from_cam for image in drafted.values()])
