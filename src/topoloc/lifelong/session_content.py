@@ -7,7 +7,7 @@ k-NN localizers receive new vectors. Their vocabulary or network stays the same.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -120,14 +120,21 @@ def create_session_content(
     frames: Sequence[MappingFrame],
     session_poses: SessionPoses,
     progress: Progress,
+    learnt: Collection[int] = (),
 ) -> SessionContent:
     """Create the content of a session. Queried frames that the map localizes well observe its
-    nodes, the others become nodes. Frames near a new node become mapping images."""
+    nodes. The others, and those in `learnt`, become nodes. If `learnt` is given, the landmarks of
+    the map locate features, too. Frames near a new node become mapping images."""
     config, content = topomap.config, SessionContent()
     by_index = {frame.index: frame for frame in frames}
     queried = {by_index[k]: one for k, one in session_poses.answers.items() if k in by_index}
-    weak = [f for f, answer in queried.items() if not is_well_localized(answer, config.d_thresh)]
-    drafts = _draft_nodes(topomap, MapPointLocator(frames, topomap), weak, progress)
+    weak = [
+        frame
+        for frame, answer in queried.items()
+        if frame.index in learnt or not is_well_localized(answer, config.d_thresh)
+    ]
+    locator = MapPointLocator(frames, topomap) if learnt else PointLocator(frames, config)
+    drafts = _draft_nodes(topomap, locator, weak, progress)
     drafted = {draft.frame: draft.image for draft in drafts}
     covered = queried.keys() - drafted.keys()
     new = NodePoses.of([image.world_from_cam for image in drafted.values()])

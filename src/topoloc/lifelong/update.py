@@ -9,12 +9,13 @@ content of the map is neither changed nor removed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from topoloc.json_data import OneLine
+from topoloc.lifelong.light_learning import find_learnable_frames, measure_learning
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
@@ -154,13 +155,23 @@ def update_map(
     poses = [session_poses.world_from_cams.get(index) for index in indices]
     posed_sequence = SequenceView(sequence, indices, poses)
     frames = select_posed_frames(posed_sequence, topomap.free_ids.session)
-    content = create_session_content(topomap, frames, session_poses, progress)
     camera = sequence[frames[0].index].camera
-    session = create_session(sequence, frames, poses_from, camera, content.lights)
-    changed = add_session(topomap, session, frames, content)
-    changed, not_updated = update_coarse_models(changed, content.views, content.images)
-    changes = {
-        "session": session.session_id,
+
+    def add(learnt: Collection[int]) -> tuple[TopoMetricMap, list[str], SessionContent]:
+        content = create_session_content(topomap, frames, session_poses, progress, learnt)
+        session = create_session(sequence, frames, poses_from, camera, content.lights)
+        changed = add_session(topomap, session, frames, content)
+        return *update_coarse_models(changed, content.views, content.images), content
+
+    learnable = find_learnable_frames(topomap, session_poses)
+    changed, not_updated, content = add(learnable)
+    learning: dict[str, Any] = {}
+    if learnable:
+        learning = measure_learning(changed, len(topomap.summaries))
+        if not learning["learned"]:
+            changed, not_updated, content = add(())
+    changes = learning | {
+        "session": changed.sessions[-1].session_id,
         "recording": sequence.name,
         "frames": len(sequence),
         "frames_with_pose": len(frames),
