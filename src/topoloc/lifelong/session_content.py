@@ -164,7 +164,10 @@ def create_session_content(
                     content.views[kind].append((features, image.camera, node_id))
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
-        content.nodes[kind] = [finish_node(*one, kind) for one in zip(new_ids, drafts, strict=True)]
+        content.nodes[kind] = [
+            finish_node(node_id, draft, kind, 400 if draft.frame.index in learnt else 800)
+            for node_id, draft in zip(new_ids, drafts, strict=True)
+        ]
     for node_id, draft in zip(new_ids, drafts, strict=True):
         content.sides.extend(
             replace(side, summary=replace(side.summary, of_node=node_id)) for side in draft.sides

@@ -10,13 +10,16 @@ content of the map is neither changed nor removed.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from topoloc.errors import MapError
 from topoloc.json_data import OneLine
 from topoloc.lifelong.light_learning import find_learnable_frames, measure_learning
 from topoloc.lifelong.node_localization import measure_recall_change
+from topoloc.lifelong.prune import prune_map
 from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
     SessionContent,
@@ -119,13 +122,17 @@ def update(
             if is_checked:
                 check_poses(posed)
         updated = update_map(edit.topomap, posed, poses_from, localizer_config, progress)
-        changes = updated.changes | {"bytes_before": edit.path.stat().st_size}
-        topomap = updated.topomap
+        before = edit.path.stat().st_size
+        changes, topomap = updated.changes | {"bytes_before": before}, updated.topomap
+        if changes.get("learned"):
+            with suppress(MapError):  # a map of few landmarks grows
+                topomap, dropped = prune_map(topomap, edit.path, before)
+                changes |= {"landmarks_dropped": dropped["landmarks_dropped"]}
         if light is not None:
             *others, last = topomap.sessions
             topomap = replace(topomap, sessions=[*others, replace(last, light_name=light)])
         edit.commit(topomap, f"update {sequence.name}", changes)
-    return replace(updated, changes=changes | {"bytes": Path(path).stat().st_size})
+    return replace(updated, topomap=topomap, changes=changes | {"bytes": Path(path).stat().st_size})
 
 
 def update_map(
