@@ -1,10 +1,14 @@
-"""Decide which images of a session teach a map another light, and whether they do."""
+"""Choose the images of a session that can teach a map another light, and measure whether they do.
+
+The map recognises little of an image in another light, although it knows the surfaces. Such images
+become nodes, whose landmarks have the depths of the map (`map_depth.py`) and the descriptors of the
+new light. They stay only if the images recognise more of each other than of the map.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -15,76 +19,59 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row
 
 
-def find_learnable_frames(
-    topomap: TopoMetricMap, session_poses: SessionPoses, min_inliers: int = 150
-) -> set[int]:
-    """Return the queried frames with a pose that look at mapped surfaces, but of which the map
-    recognises fewer than `min_inliers` landmarks."""
-    reach, max_turn_deg = 4.0, 30.0  # of the nearest node: D_thresh, and degrees
-    found = set[int]()
+def find_learnable_frames(topomap: TopoMetricMap, session_poses: SessionPoses) -> set[int]:
+    """Return the queried frames that see surfaces of the map, of which the map recognises little.
+    Their poses are known."""
+    min_inliers = 150  # an image with more is localized in all likelihood from beside it, too
+    reach, max_turn_deg = 4.0, 30.0  # to the nearest node: in D_thresh, and degrees
+    nodes, found = topomap.node_poses, set[int]()
     for index, answer in session_poses.answers.items():
         pose = session_poses.world_from_cams.get(index)
         if pose is not None and (answer is None or answer.num_inliers < min_inliers):
-            nodes = topomap.node_poses
             metres = np.linalg.norm(nodes.centres - pose.translation, axis=1)
             along = nodes.rotations[:, :, 2] @ pose.rotation[:, 2]
-            near = metres <= reach * topomap.config.d_thresh
-            if (near & (along > math.cos(math.radians(max_turn_deg)))).any():
+            is_near = metres <= reach * topomap.config.d_thresh
+            if (is_near & (along > math.cos(math.radians(max_turn_deg)))).any():
                 found.add(index)
     return found
 
 
-def measure_learning(changed: TopoMetricMap, num_old: int) -> dict[str, Any]:
-    """Look for the landmarks that the map had (its first `num_old` nodes), and for those that it
-    learned, in each new node's image. Its own landmarks are left out: the neighbours' are looked
-    for. Return the counts by the names of the history, and whether the map `learned`: more of the
-    new ones are recognised."""
-    min_gain = 1.1
-    rows, num = changed.rows[num_old:], [0, 0]
-    reach = 8.0 * changed.config.d_thresh
-    asked = 0
-    for row in rows:
-        others = [k for k in rows if k != row]
-        pose = changed.summaries[row].world_from_cam
-        others = [
-            k
-            for k in others
-            if np.linalg.norm(changed.summaries[k].world_from_cam.translation - pose.translation)
-            <= reach
-        ]
-        if others:
-            asked += 1
-            counts = [_count_recognised(changed, row, group) for group in (changed.rows[:num_old], others)]
-            print(row, counts)
-            num = [a + b for a, b in zip(num, counts, strict=True)]
+def measure_learning(
+    changed: TopoMetricMap, num_old: int, names: Collection[str]
+) -> dict[str, int]:
+    """Look in the images `names` of new nodes for landmarks of the map that it was before (the
+    first `num_old` nodes), and for landmarks of the other images.
+
+    Return by the names of the map's history the number of images, of those that `learned` shows to
+    help, and of the landmarks recognised in them. All or none help.
+    """
+    min_gain = 1.25  # images in the map's own light show less of each other than of the map
+    reach_m = 8.0 * changed.config.d_thresh  # images farther from all others tell nothing
+    new = [row for row in changed.rows[num_old:] if changed.summaries[row].name in names]
+    by_map = by_others = 0
+    for row in new:
+        others = [other for other in new if other != row]
+        apart = changed.node_poses.centres[others] - changed.node_poses.centres[row]
+        if np.linalg.norm(apart, axis=1).min(initial=np.inf) <= reach_m:
+            by_map += _count_recognised(changed, row, changed.rows[:num_old])
+            by_others += _count_recognised(changed, row, others)
     return {
-        "learned": num[1] > min_gain * num[0],
-        "left_out_asked": asked,
-        "left_out_recognised_before": num[0],
-        "left_out_recognised_after": num[1],
+        "poorly_recognised": len(names),
+        "learned": len(new) if by_others > min_gain * by_map else 0,
+        "landmarks_of_map_seen": by_map,
+        "landmarks_of_each_other_seen": by_others,
     }
 
 
 def _count_recognised(topomap: TopoMetricMap, row: Row, known: Sequence[Row]) -> int:
-    """Return how many landmarks of the best of the two nearest nodes among `known` are recognised
-    in the image of a node, at its pose."""
-    config, pose = topomap.config, topomap.summaries[row].world_from_cam
-    poses = topomap.node_poses.rows(known)
-    nearest = find_nearest_nodes(pose, poses, config.lambda_rot, 2)
+    """Return how many landmarks the image of a node shows of one of the two nearest nodes among
+    `known`, the better one."""
+    pose, poses = topomap.summaries[row].world_from_cam, topomap.node_poses.rows(known)
+    nearest = find_nearest_nodes(pose, poses, topomap.config.lambda_rot, 2)
     counts = [0]
     for one in (known[k] for k in nearest):
         cam_from_node = pose.inverse() @ topomap.summaries[one].world_from_cam
-        counts.append(
-            sum(
-                len(
-                    observe_node(
-                        layer.nodes[one],
-                        layer.nodes[row].features,
-                        layer.nodes[row].camera,
-                        cam_from_node,
-                    ).rows
-                )
-                for layer in topomap.layers.values()
-            )
-        )
+        pairs = [(layer.nodes[one], layer.nodes[row]) for layer in topomap.layers.values()]
+        seen = (observe_node(a, b.features, b.camera, cam_from_node) for a, b in pairs)
+        counts.append(sum(len(one.rows) for one in seen))
     return max(counts)

@@ -127,7 +127,7 @@ def update(
         if changes.get("learned"):
             with suppress(MapError):  # a map of few landmarks grows
                 topomap, dropped = prune_map(topomap, edit.path, before)
-                changes |= {"landmarks_dropped": dropped["landmarks_dropped"]}
+                changes |= {name: dropped[name] for name in ("nodes_dropped", "landmarks_dropped")}
         if light is not None:
             *others, last = topomap.sessions
             topomap = replace(topomap, sessions=[*others, replace(last, light_name=light)])
@@ -162,23 +162,23 @@ def update_map(
     poses = [session_poses.world_from_cams.get(index) for index in indices]
     posed_sequence = SequenceView(sequence, indices, poses)
     frames = select_posed_frames(posed_sequence, topomap.free_ids.session)
-    camera = sequence[frames[0].index].camera
+    learnable = find_learnable_frames(topomap, session_poses)
 
-    def add(learnt: Collection[int]) -> tuple[TopoMetricMap, list[str], SessionContent]:
+    def add_frames(learnt: Collection[int]) -> tuple[TopoMetricMap, SessionContent, list[str]]:
         content = create_session_content(topomap, frames, session_poses, progress, learnt)
+        camera = sequence[frames[0].index].camera
         session = create_session(sequence, frames, poses_from, camera, content.lights)
         changed = add_session(topomap, session, frames, content)
-        return *update_coarse_models(changed, content.views, content.images), content
+        changed, not_updated = update_coarse_models(changed, content.views, content.images)
+        return changed, content, not_updated
 
-    learnable = find_learnable_frames(topomap, session_poses)
-    changed, not_updated, content = add(learnable)
-    learning: dict[str, Any] = {}
-    if learnable:
-        learning = measure_learning(changed, len(topomap.summaries))
-        if not learning["learned"]:
-            changed, not_updated, content = add(())
-    changes = learning | {
-        "session": changed.sessions[-1].session_id,
+    changed, content, not_updated = add_frames(learnable)
+    names = {frame.name for frame in frames if frame.index in learnable}
+    learning = measure_learning(changed, len(topomap.summaries), names) if names else {}
+    if learning.get("learned") == 0:
+        changed, content, not_updated = add_frames(())
+    changes = {
+        "session": frames[0].session_id,
         "recording": sequence.name,
         "frames": len(sequence),
         "frames_with_pose": len(frames),
@@ -192,7 +192,7 @@ def update_map(
         "points_added": sum(len(node.features) for node in content.nodes[topomap.kind]),
         "place_images_added": len(content.images),
         "not_taught": not_updated,
-    }
+    } | learning
     changed = with_map_statistics(changed, progress)
     recall = measure_recall_change(topomap, changed, localizer_config)
     return MapUpdate(changed, posed_sequence, changes | recall)

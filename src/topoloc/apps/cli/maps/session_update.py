@@ -226,7 +226,21 @@ def describe_update(changes: dict[str, Any]) -> str:
     localized = f"{c['localized']} of {c['asked']} images were localized"
     size = f"{c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB"
     added = f"{c['nodes_added']} nodes added"
-    return f"{seen}, {localized}, {added}, {size}{describe_outdated_models(changes)}"
+    more = f"{describe_learning(changes)}{describe_outdated_models(changes)}"
+    return f"{seen}, {localized}, {added}, {size}{more}"
+
+
+def describe_learning(changes: dict[str, Any]) -> str:
+    """Return what the map learned of images that it recognises poorly, if there are any."""
+    if not (num := changes.get("poorly_recognised")):
+        return ""
+    of_map, of_others = changes["landmarks_of_map_seen"], changes["landmarks_of_each_other_seen"]
+    seen = f"they show {of_others} landmarks of each other, {of_map} of the map before"
+    if learned := changes["learned"]:
+        room = f"{changes.get('landmarks_dropped', 0)} landmarks that are seen least made room"
+        return f"; it learned the light of {learned} images: {seen}; {room}"
+    remedy = "record the place in this light again, with images closer together"
+    return f"; {num} poorly recognised images taught it nothing: {seen}; {remedy}"
 
 
 def describe_outdated_models(changes: dict[str, Any]) -> str:
