@@ -36,28 +36,35 @@ def find_learnable_frames(topomap: TopoMetricMap, session_poses: SessionPoses) -
     return found
 
 
-def measure_learning(
+def find_learned_images(
     changed: TopoMetricMap, num_old: int, names: Collection[str]
-) -> dict[str, int]:
+) -> tuple[set[str], dict[str, int]]:
     """Look in the images `names` of new nodes for landmarks of the map that it was before (the
     first `num_old` nodes), and for landmarks of the other images.
 
-    Return by the names of the map's history the number of images, of those that `learned` shows to
-    help, and of the landmarks recognised in them. All or none help.
+    Return the images that stay, all or none but those that contradict their poses, and the numbers
+    of images and recognised landmarks by the names of the map's history.
     """
     min_gain = 1.25  # images in the map's own light show less of each other than of the map
+    min_recognised = 30  # landmarks that an image shows where its pose predicts them
     reach_m = 8.0 * changed.config.d_thresh  # images farther from all others tell nothing
     new = [row for row in changed.rows[num_old:] if changed.summaries[row].name in names]
-    by_map = by_others = 0
+    by_map, by_others, learned = 0, 0, set[str]()
     for row in new:
         others = [other for other in new if other != row]
         apart = changed.node_poses.centres[others] - changed.node_poses.centres[row]
+        of_map = _count_recognised(changed, row, changed.rows[:num_old])
+        of_others = 0
         if np.linalg.norm(apart, axis=1).min(initial=np.inf) <= reach_m:
-            by_map += _count_recognised(changed, row, changed.rows[:num_old])
-            by_others += _count_recognised(changed, row, others)
-    return {
+            of_others = _count_recognised(changed, row, others)
+            by_map, by_others = by_map + of_map, by_others + of_others
+        if max(of_map, of_others) >= min_recognised:
+            learned.add(changed.summaries[row].name)
+    if by_others <= min_gain * by_map:
+        learned.clear()
+    return learned, {
         "poorly_recognised": len(names),
-        "learned": len(new) if by_others > min_gain * by_map else 0,
+        "learned": len(learned),
         "landmarks_of_map_seen": by_map,
         "landmarks_of_each_other_seen": by_others,
     }

@@ -7,11 +7,11 @@ projected beside it, and its descriptor is that of the new light.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from topoloc.features.features import Features
 from topoloc.geometry.rig import points_from_depth
@@ -26,19 +26,22 @@ _MIN_BESIDE = 4  # landmarks that give a feature its depth
 
 
 class MapPointLocator(PointLocator):
-    """Locate the features of mapping frames in 3-D. The landmarks of `topomap` locate those that a
-    single camera cannot triangulate."""
+    """Locate the features of mapping frames in 3-D. What a single camera cannot triangulate in the
+    images `learnt` (by index) is located by the landmarks of `topomap`."""
 
-    def __init__(self, frames: Sequence[MappingFrame], topomap: TopoMetricMap) -> None:
+    def __init__(
+        self, frames: Sequence[MappingFrame], topomap: TopoMetricMap, learnt: Collection[int]
+    ) -> None:
         super().__init__(frames, topomap.config)
-        self._topomap = topomap
+        self._topomap, self._learnt = topomap, learnt
 
     def locate(
         self, frame: MappingFrame, view: PreparedFrame, image: MappingImage
     ) -> tuple[dict[str, MetricPoints], list[MappingFrame]]:
         """Return as `PointLocator.locate`."""
         located, others = super().locate(frame, view, image)
-        if view.right_grey is not None or view.depth is not None:
+        has_depth = view.right_grey is not None or view.depth is not None
+        if has_depth or frame.index not in self._learnt:
             return located, others
         landmarks = _project_landmarks(self._topomap, image)
         for kind, features in image.features.items():
@@ -124,7 +127,7 @@ def _fit_surfaces(
     prior = np.zeros((len(mean), 3, 3))
     prior[:, 0, 0] = 1e-9 / mean**2
     prior[:, [1, 2], [1, 2]] = 1.0 / (slope * mean[:, None]) ** 2
-    agrees: Bool[np.ndarray, "n k"] = is_near
+    agrees, fit, residuals = is_near, np.zeros((len(mean), 3, 1)), inverse_depths
     for _ in range(3):
         weighted = (
             design.transpose(0, 2, 1) * (agrees * np.exp(-2.0 * squares) / sigmas**2)[:, None]

@@ -123,8 +123,8 @@ def create_session_content(
     learnt: Collection[int] = (),
 ) -> SessionContent:
     """Create the content of a session. Queried frames that the map localizes well observe its
-    nodes. The others, and those in `learnt`, become nodes. If `learnt` is given, the landmarks of
-    the map locate features, too. Frames near a new node become mapping images."""
+    nodes. The others, and those in `learnt` (by index, `light_learning.py`), become nodes. Frames
+    near a new node become mapping images."""
     config, content = topomap.config, SessionContent()
     by_index = {frame.index: frame for frame in frames}
     queried = {by_index[k]: one for k, one in session_poses.answers.items() if k in by_index}
@@ -133,8 +133,7 @@ def create_session_content(
         for frame, answer in queried.items()
         if frame.index in learnt or not is_well_localized(answer, config.d_thresh)
     ]
-    locator = MapPointLocator(frames, topomap) if learnt else PointLocator(frames, config)
-    drafts = _draft_nodes(topomap, locator, weak, progress)
+    drafts = _draft_nodes(topomap, MapPointLocator(frames, topomap, learnt), weak, progress)
     drafted = {draft.frame: draft.image for draft in drafts}
     covered = queried.keys() - drafted.keys()
     new = NodePoses.of([image.world_from_cam for image in drafted.values()])

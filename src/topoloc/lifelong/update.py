@@ -17,7 +17,7 @@ from typing import Any
 
 from topoloc.errors import MapError
 from topoloc.json_data import OneLine
-from topoloc.lifelong.light_learning import find_learnable_frames, measure_learning
+from topoloc.lifelong.light_learning import find_learnable_frames, find_learned_images
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.prune import prune_map
 from topoloc.lifelong.session_checks import check_session_is_new
@@ -173,10 +173,12 @@ def update_map(
         return changed, content, not_updated
 
     changed, content, not_updated = add_frames(learnable)
-    names = {frame.name for frame in frames if frame.index in learnable}
-    learning = measure_learning(changed, len(topomap.summaries), names) if names else {}
-    if learning.get("learned") == 0:
-        changed, content, not_updated = add_frames(())
+    learning = dict[str, int]()
+    if names := {frame.name for frame in frames if frame.index in learnable}:
+        learned, learning = find_learned_images(changed, len(topomap.summaries), names)
+        if learned != names:
+            left = [frame.index for frame in frames if frame.name in learned]
+            changed, content, not_updated = add_frames(left)
     changes = {
         "session": frames[0].session_id,
         "recording": sequence.name,
