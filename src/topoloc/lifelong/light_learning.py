@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from itertools import pairwise
 
 import numpy as np
 
+from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.session_poses import SessionPoses
 from topoloc.mapping.node_drafts import observe_node
 from topoloc.mapping.nodes import find_nearest_nodes
@@ -19,9 +21,9 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row
 
 
-def find_learnable_frames(topomap: TopoMetricMap, session_poses: SessionPoses) -> set[int]:
-    """Return the queried frames that see surfaces of the map, of which the map recognises little.
-    Their poses are known."""
+def find_poorly_recognised(topomap: TopoMetricMap, session_poses: SessionPoses) -> set[int]:
+    """Return the queried frames with a pose that see surfaces of the map, of which the map
+    recognises little."""
     min_inliers = 150  # an image with more is localized in all likelihood from beside it, too
     reach, max_turn_deg = 4.0, 30.0  # to the nearest node: in D_thresh, and degrees
     nodes, found = topomap.node_poses, set[int]()
@@ -36,6 +38,37 @@ def find_learnable_frames(topomap: TopoMetricMap, session_poses: SessionPoses) -
     return found
 
 
+def select_learnable(
+    frames: Collection[int],
+    motion: Sequence[Rigid3 | None],
+    session_poses: SessionPoses,
+    d_thresh: float,
+) -> set[int]:
+    """Return the frames whose poses are certain: the map's answers agree with them. Without an
+    answer the session's own `motion` must agree with the answers from image to image."""
+    # Largest error of a pose, in D_thresh, and of the answer's sigmas that are added.
+    max_error_m, num_sigmas = 0.1 * d_thresh, 3.0
+    answers = {index: one for index, one in session_poses.answers.items() if one is not None}
+    known = [
+        (pose, one.world_from_cam)
+        for index, one in answers.items()
+        if (pose := motion[index]) is not None
+    ]
+    errors_m = [
+        float(np.linalg.norm((a.inverse() @ b).translation - (c.inverse() @ d).translation))
+        for (a, c), (b, d) in pairwise(known)
+    ]
+    is_motion_good = np.median(errors_m or [0.0]) <= max_error_m
+
+    def is_certain(index: int) -> bool:
+        if (answer := answers.get(index)) is None:
+            return bool(is_motion_good)
+        pose, tolerance = session_poses.world_from_cams[index], num_sigmas * answer.position_sigma_m
+        return pose.is_same(answer.world_from_cam, max_error_m + tolerance, math.pi)
+
+    return set(filter(is_certain, frames))
+
+
 def find_learned_images(
     changed: TopoMetricMap, num_old: int, names: Collection[str]
 ) -> tuple[set[str], dict[str, int]]:
@@ -43,7 +76,7 @@ def find_learned_images(
     first `num_old` nodes), and for landmarks of the other images.
 
     Return the images that stay, all or none but those that contradict their poses, and the numbers
-    of images and recognised landmarks by the names of the map's history.
+    of recognised landmarks by the names of the map's history.
     """
     min_gain = 1.25  # images in the map's own light show less of each other than of the map
     min_recognised = 30  # landmarks that an image shows where its pose predicts them
@@ -63,8 +96,6 @@ def find_learned_images(
     if by_others <= min_gain * by_map:
         learned.clear()
     return learned, {
-        "poorly_recognised": len(names),
-        "learned": len(learned),
         "landmarks_of_map_seen": by_map,
         "landmarks_of_each_other_seen": by_others,
     }

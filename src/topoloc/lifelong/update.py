@@ -17,7 +17,11 @@ from typing import Any
 
 from topoloc.errors import MapError
 from topoloc.json_data import OneLine
-from topoloc.lifelong.light_learning import find_learnable_frames, find_learned_images
+from topoloc.lifelong.light_learning import (
+    find_learned_images,
+    find_poorly_recognised,
+    select_learnable,
+)
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.prune import prune_map
 from topoloc.lifelong.session_checks import check_session_is_new
@@ -162,7 +166,8 @@ def update_map(
     poses = [session_poses.world_from_cams.get(index) for index in indices]
     posed_sequence = SequenceView(sequence, indices, poses)
     frames = select_posed_frames(posed_sequence, topomap.free_ids.session)
-    learnable = find_learnable_frames(topomap, session_poses)
+    poor = find_poorly_recognised(topomap, session_poses)
+    learnable = select_learnable(poor, sequence.poses, session_poses, topomap.config.d_thresh)
 
     def add_frames(learnt: Collection[int]) -> tuple[TopoMetricMap, SessionContent, list[str]]:
         content = create_session_content(topomap, frames, session_poses, progress, learnt)
@@ -173,9 +178,10 @@ def update_map(
         return changed, content, not_updated
 
     changed, content, not_updated = add_frames(learnable)
-    learning = dict[str, int]()
+    learning = {"poorly_recognised": len(poor), "learned": 0} if poor else {}
     if names := {frame.name for frame in frames if frame.index in learnable}:
-        learned, learning = find_learned_images(changed, len(topomap.summaries), names)
+        learned, seen = find_learned_images(changed, len(topomap.summaries), names)
+        learning |= {"learned": len(learned)} | seen
         if learned != names:
             left = [frame.index for frame in frames if frame.name in learned]
             changed, content, not_updated = add_frames(left)

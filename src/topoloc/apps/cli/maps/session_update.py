@@ -234,6 +234,9 @@ def describe_learning(changes: dict[str, Any]) -> str:
     """Return what the map learned of images that it recognises poorly, if there are any."""
     if not (num := changes.get("poorly_recognised")):
         return ""
+    if "landmarks_of_map_seen" not in changes:
+        fault, remedy = "its poses do not agree with the map", "give better ones, or none"
+        return f"; {num} poorly recognised images taught it nothing: {fault}; {remedy}"
     of_map, of_others = changes["landmarks_of_map_seen"], changes["landmarks_of_each_other_seen"]
     seen = f"they show {of_others} landmarks of each other, {of_map} of the map before"
     if learned := changes["learned"]:
