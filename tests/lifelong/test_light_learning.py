@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc import Localizer, StereoSequence, TopoMetricMap, open_sequence
+from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.apps.cli import main
 from topoloc.demo import lab
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -44,14 +44,11 @@ def _errors_m(path: Path, recording: str | Path) -> list[float]:
             result = localizer.localize(frame.image, frame.camera)
             if isinstance(result, Localization):
                 true = frame.world_from_cam
-                off = np.inf if true is None else result.world_from_cam.translation - true.translation
+                off = (
+                    np.inf if true is None else result.world_from_cam.translation - true.translation
+                )
                 errors.append(float(np.linalg.norm(off)))
     return errors
-
-
-def _write_poses(sequence: StereoSequence, poses: list[Rigid3], path: Path) -> Path:
-    Trajectory.of_frames(poses, sequence.t_ns).write_tum(path)
-    return path
 
 
 def test_a_night_is_learned_in_the_room_that_the_map_takes(
@@ -78,37 +75,56 @@ def test_a_night_is_learned_in_the_room_that_the_map_takes(
     assert map_file.read_bytes() == before
 
 
-def test_a_session_of_another_place_or_with_wrong_poses_is_refused(
-    map_file: Path, tmp_path: Path, complaint: Callable[..., str]
+@pytest.mark.parametrize(
+    ("move", "fault"),
+    [
+        (
+            Rigid3(exp_so3(np.array([0.0, 0.17, 0.0])), np.zeros(3)),
+            "do not agree with the map; give",
+        ),
+        (Rigid3(np.eye(3), np.array([0.0, 1.0, 0.0])), "do not agree with the map; give"),
+        (
+            Rigid3(exp_so3(np.array([0.17, 0.0, 0.0])), np.zeros(3)),
+            "agree with its poses; no map is",
+        ),
+        (Rigid3(np.eye(3), np.array([1.0, 0.0, 0.0])), "a metre of its poses is 0.5"),
+    ],
+)
+def test_cameras_that_are_turned_or_shifted_teach_nothing(
+    map_file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], move: Rigid3, fault: str
 ):
-    before, night = map_file.read_bytes(), open_sequence(TAUGHT)
-    true = [pose for pose in night.poses if pose is not None]
-    turn = Rigid3(exp_so3(np.array([0.0, np.radians(10.0), 0.0])), np.zeros(3))
-    aside = Rigid3(np.eye(3), np.array([1.0, 0.0, 0.0]))
-    for fault, poses in (
-        ("agree with its poses", [pose @ turn for pose in true]),
-        ("its poses", [pose @ aside for pose in true]),
-    ):
-        file = _write_poses(night, poses, tmp_path / "wrong.tum")
-        said = complaint("update", map_file, TAUGHT, "--trajectory", file, "--poses", "unchecked")
-        assert fault in said
+    with TopoMetricMap.load(map_file) as topomap:
+        before = [node.points_cam for node in topomap.nodes]
+    night, file = open_sequence(TAUGHT), tmp_path / "wrong.tum"
+    Trajectory.of_frames([pose and pose @ move for pose in night.poses], night.t_ns).write_tum(file)
+    words = ["--trajectory", str(file), "--poses", "unchecked"]
+    status = main(["update", str(map_file), TAUGHT, *words])
+    said = capfd.readouterr()
+    assert fault in said.out + said.err
+    assert (said.out + said.err).count("\n") == 1
+    assert status == ("no map" in said.err)
+    with TopoMetricMap.load(map_file) as topomap:
+        np.testing.assert_equal([node.points_cam for node in topomap.nodes], before)
+
+
+def test_a_walk_elsewhere_is_refused(map_file: Path, complaint: Callable[..., str]):
+    before = map_file.read_bytes()
     assert "recognises 0 of" in complaint("update", map_file, LAB / "street")
+    day = shutil.copy(LAB / "day" / "truth.tum", map_file.with_suffix(".tum"))
+    assert "are not the poses'" in complaint("update", map_file, TAUGHT, "--trajectory", day)
     assert map_file.read_bytes() == before
 
 
-def test_poses_of_another_walk_teach_nothing(
+def test_images_that_show_nothing_where_their_poses_predict_it_teach_nothing(
     map_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Where the map recognises images, it corrects their poses. The others contradict theirs."""
-    night = open_sequence(TAUGHT)
-    true = [pose for pose in night.poses if pose is not None]
-    wrong = [
-        pose @ Rigid3(np.eye(3), np.array([0.0, 0.0, 0.3 * (6 <= k <= 8)]))
-        for k, pose in enumerate(true)
-    ]
-    file = _write_poses(night, wrong, tmp_path / "wrong.tum")
+    """The map recognises the others, and knows where they are."""
+    night, ahead = open_sequence(TAUGHT), Rigid3(np.eye(3), np.array([0.0, 0.0, 0.3]))
+    poses = [pose and (pose @ ahead if 6 <= k <= 8 else pose) for k, pose in enumerate(night.poses)]
+    file = tmp_path / "wrong.tum"
+    Trajectory.of_frames(poses, night.t_ns).write_tum(file)
     words = ["update", str(map_file), TAUGHT, "--trajectory", str(file), "--poses", "unchecked"]
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "0 nodes added" in said
-    assert "poorly recognised images taught it nothing" in said
+    assert "poorly recognised images taught it nothing: they show" in said

@@ -8,7 +8,7 @@ new light. They stay only if the images recognise more of each other than of the
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Sequence, Set
 from itertools import pairwise
 
 import numpy as np
@@ -39,12 +39,13 @@ def find_poorly_recognised(topomap: TopoMetricMap, session_poses: SessionPoses) 
 
 
 def select_learnable(
-    frames: Collection[int],
+    poor: Set[int],
     motion: Sequence[Rigid3 | None],
     session_poses: SessionPoses,
     d_thresh: float,
 ) -> set[int]:
-    """Return the frames whose poses are certain: the map's answers agree with them. Without an
+    """Return the frames that the map recognises poorly (`poor`) and the queried ones before and
+    after each, as far as their poses are certain: the map's answers agree with them. Without an
     answer the session's own `motion` must agree with the answers from image to image."""
     # Largest error of a pose, in D_thresh, and of the answer's sigmas that are added.
     max_error_m, num_sigmas = 0.1 * d_thresh, 3.0
@@ -66,7 +67,9 @@ def select_learnable(
         pose, tolerance = session_poses.world_from_cams[index], num_sigmas * answer.position_sigma_m
         return pose.is_same(answer.world_from_cam, max_error_m + tolerance, math.pi)
 
-    return set(filter(is_certain, frames))
+    queried = [index for index in session_poses.answers if index in session_poses.world_from_cams]
+    beside = {one for pair in pairwise(queried) if not poor.isdisjoint(pair) for one in pair}
+    return set(filter(is_certain, beside | poor))
 
 
 def find_learned_images(
