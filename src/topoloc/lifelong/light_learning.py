@@ -8,7 +8,7 @@ new light. They stay only if the images recognise more of each other than of the
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from itertools import pairwise
 
 import numpy as np
@@ -31,9 +31,10 @@ def find_poorly_recognised(topomap: TopoMetricMap, session_poses: SessionPoses) 
         pose = session_poses.world_from_cams.get(index)
         if pose is not None and (answer is None or answer.num_inliers < min_inliers):
             metres = np.linalg.norm(nodes.centres - pose.translation, axis=1)
-            along = nodes.rotations[:, :, 2] @ pose.rotation[:, 2]
-            is_near = metres <= reach * topomap.config.d_thresh
-            if (is_near & (along > math.cos(math.radians(max_turn_deg)))).any():
+            is_along = nodes.rotations[:, :, 2] @ pose.rotation[:, 2] > np.cos(
+                np.radians(max_turn_deg)
+            )
+            if (is_along & (metres <= reach * topomap.config.d_thresh)).any():
                 found.add(index)
     return found
 
@@ -44,75 +45,67 @@ def select_learnable(
     session_poses: SessionPoses,
     d_thresh: float,
 ) -> set[int]:
-    """Return the frames that the map recognises poorly (`poor`) and the queried ones before and
-    after each, as far as their poses are certain: the map's answers agree with them. Without an
-    answer the session's own `motion` must agree with the answers from image to image."""
-    # Largest error of a pose, in D_thresh, and of the answer's sigmas that are added.
-    max_error_m, num_sigmas = 0.1 * d_thresh, 3.0
+    """Return the frames `poor` and the queried ones beside each, if their poses are certain: the
+    map's answers agree with them. Without an answer, the session's own `motion` must agree with the
+    answers from image to image. None is returned without one of `poor`."""
+    max_error_m, num_sigmas = 0.1 * d_thresh, 3.0  # the answer's sigmas are added
+    poses = session_poses.world_from_cams
     answers = {index: one for index, one in session_poses.answers.items() if one is not None}
-    known = [
-        (pose, one.world_from_cam)
-        for index, one in answers.items()
-        if (pose := motion[index]) is not None
-    ]
+    known = [(pose, answers[k].world_from_cam) for k in answers if (pose := motion[k]) is not None]
     errors_m = [
-        float(np.linalg.norm((a.inverse() @ b).translation - (c.inverse() @ d).translation))
+        np.linalg.norm((a.inverse() @ b).translation - (c.inverse() @ d).translation)
         for (a, c), (b, d) in pairwise(known)
     ]
-    is_motion_good = np.median(errors_m or [0.0]) <= max_error_m
+    is_motion_good = bool(np.median(errors_m or [0.0]) <= max_error_m)
 
     def is_certain(index: int) -> bool:
         if (answer := answers.get(index)) is None:
-            return bool(is_motion_good)
-        pose, tolerance = session_poses.world_from_cams[index], num_sigmas * answer.position_sigma_m
-        return pose.is_same(answer.world_from_cam, max_error_m + tolerance, math.pi)
+            return is_motion_good
+        tolerance_m = max_error_m + num_sigmas * answer.position_sigma_m
+        return poses[index].is_same(answer.world_from_cam, tolerance_m, math.pi)
 
-    queried = [index for index in session_poses.answers if index in session_poses.world_from_cams]
+    queried = filter(poses.__contains__, session_poses.answers)
     beside = {one for pair in pairwise(queried) if not poor.isdisjoint(pair) for one in pair}
-    return set(filter(is_certain, beside | poor))
+    certain = set(filter(is_certain, beside | poor))
+    return certain if certain & poor else set()
 
 
 def find_learned_images(
-    changed: TopoMetricMap, num_old: int, names: Collection[str]
-) -> tuple[set[str], dict[str, int]]:
-    """Look in the images `names` of new nodes for landmarks of the map that it was before (the
-    first `num_old` nodes), and for landmarks of the other images.
+    changed: TopoMetricMap, num_old: int, indices: Mapping[str, int], poor: Set[int]
+) -> tuple[set[int], dict[str, int]]:
+    """Look in the images of new nodes (`indices`: their frames by name) for landmarks of the map
+    that it was before (the first `num_old` nodes), and for landmarks of the other images.
 
-    Return the images that stay, all or none but those that contradict their poses, and the numbers
-    of recognised landmarks by the names of the map's history.
+    Return the frames that stay and the numbers of recognised landmarks by the names of the map's
+    history. All stay or none, as the frames `poor` tell, but those that contradict their poses.
     """
     min_gain = 1.25  # images in the map's own light show less of each other than of the map
     min_recognised = 30  # landmarks that an image shows where its pose predicts them
-    reach_m = 8.0 * changed.config.d_thresh  # images farther from all others tell nothing
-    new = [row for row in changed.rows[num_old:] if changed.summaries[row].name in names]
-    by_map, by_others, learned = 0, 0, set[str]()
+    new = [row for row in changed.rows[num_old:] if changed.summaries[row].name in indices]
+    by_map, by_others, learned = 0, 0, set[int]()
     for row in new:
-        others = [other for other in new if other != row]
-        apart = changed.node_poses.centres[others] - changed.node_poses.centres[row]
+        index, others = indices[changed.summaries[row].name], [one for one in new if one != row]
         of_map = _count_recognised(changed, row, changed.rows[:num_old])
-        of_others = 0
-        if np.linalg.norm(apart, axis=1).min(initial=np.inf) <= reach_m:
-            of_others = _count_recognised(changed, row, others)
-            by_map, by_others = by_map + of_map, by_others + of_others
+        of_others = _count_recognised(changed, row, others)
         if max(of_map, of_others) >= min_recognised:
-            learned.add(changed.summaries[row].name)
-    if by_others <= min_gain * by_map:
-        learned.clear()
-    return learned, {
-        "landmarks_of_map_seen": by_map,
-        "landmarks_of_each_other_seen": by_others,
-    }
+            learned.add(index)
+            if index in poor:
+                by_map, by_others = by_map + of_map, by_others + of_others
+    is_learned = by_others > min_gain * by_map
+    seen = {"landmarks_of_map_seen": by_map, "landmarks_of_each_other_seen": by_others}
+    return learned if is_learned else set(), seen
 
 
 def _count_recognised(topomap: TopoMetricMap, row: Row, known: Sequence[Row]) -> int:
     """Return how many landmarks the image of a node shows of one of the two nearest nodes among
     `known`, the better one."""
     pose, poses = topomap.summaries[row].world_from_cam, topomap.node_poses.rows(known)
-    nearest = find_nearest_nodes(pose, poses, topomap.config.lambda_rot, 2)
-    counts = [0]
-    for one in (known[k] for k in nearest):
-        cam_from_node = pose.inverse() @ topomap.summaries[one].world_from_cam
-        pairs = [(layer.nodes[one], layer.nodes[row]) for layer in topomap.layers.values()]
+
+    def count(other: Row) -> int:
+        cam_from_node = pose.inverse() @ topomap.summaries[other].world_from_cam
+        pairs = [(layer.nodes[other], layer.nodes[row]) for layer in topomap.layers.values()]
         seen = (observe_node(a, b.features, b.camera, cam_from_node) for a, b in pairs)
-        counts.append(sum(len(one.rows) for one in seen))
-    return max(counts)
+        return sum(len(one.rows) for one in seen)
+
+    nearest = find_nearest_nodes(pose, poses, topomap.config.lambda_rot, 2) if known else []
+    return max((count(known[k]) for k in nearest), default=0)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
+from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
 from topoloc.lifelong.light_learning import (
     find_learned_images,
@@ -30,7 +31,7 @@ from topoloc.lifelong.session_content import (
     create_session_content,
     update_coarse_models,
 )
-from topoloc.lifelong.session_poses import estimate_poses_by_motion
+from topoloc.lifelong.session_poses import SessionPoses, estimate_poses_by_motion
 from topoloc.lifelong.single_camera_poses import estimate_poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
@@ -55,6 +56,9 @@ from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
 from topoloc.tracking.tracker import Tracker
+
+_Added = tuple[TopoMetricMap, SessionContent, list[str]]
+"""The map with a session, the content of it, and the coarse localizers that were not updated."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,10 +170,8 @@ def update_map(
     poses = [session_poses.world_from_cams.get(index) for index in indices]
     posed_sequence = SequenceView(sequence, indices, poses)
     frames = select_posed_frames(posed_sequence, topomap.free_ids.session)
-    poor = find_poorly_recognised(topomap, session_poses)
-    learnable = select_learnable(poor, sequence.poses, session_poses, topomap.config.d_thresh)
 
-    def add_frames(learnt: Collection[int]) -> tuple[TopoMetricMap, SessionContent, list[str]]:
+    def add_frames(learnt: Collection[int]) -> _Added:
         content = create_session_content(topomap, frames, session_poses, progress, learnt)
         camera = sequence[frames[0].index].camera
         session = create_session(sequence, frames, poses_from, camera, content.lights)
@@ -177,14 +179,8 @@ def update_map(
         changed, not_updated = update_coarse_models(changed, content.views, content.images)
         return changed, content, not_updated
 
-    changed, content, not_updated = add_frames(learnable)
-    learning = {"poorly_recognised": len(poor), "learned": 0} if poor else {}
-    if names := {frame.name for frame in frames if frame.index in learnable}:
-        learned, seen = find_learned_images(changed, len(topomap.summaries), names)
-        learning |= {"learned": len(learned)} | seen
-        if learned != names:
-            left = [frame.index for frame in frames if frame.name in learned]
-            changed, content, not_updated = add_frames(left)
+    added, learning = _learn_light(topomap, sequence.poses, frames, session_poses, add_frames)
+    changed, content, not_updated = added
     changes = {
         "session": frames[0].session_id,
         "recording": sequence.name,
@@ -204,6 +200,26 @@ def update_map(
     changed = with_map_statistics(changed, progress)
     recall = measure_recall_change(topomap, changed, localizer_config)
     return MapUpdate(changed, posed_sequence, changes | recall)
+
+
+def _learn_light(
+    topomap: TopoMetricMap,
+    motion: Sequence[Rigid3 | None],
+    frames: Sequence[MappingFrame],
+    session_poses: SessionPoses,
+    add_frames: Callable[[Collection[int]], _Added],
+) -> tuple[_Added, dict[str, int]]:
+    """Return what `add_frames` adds with those images as nodes that teach the map another light,
+    and their numbers by the names of the map's history, none if the map recognises all well."""
+    poor = find_poorly_recognised(topomap, session_poses)
+    learnable = select_learnable(poor, motion, session_poses, topomap.config.d_thresh)
+    added, learned, seen = add_frames(learnable), learnable, dict[str, int]()
+    if learnable:
+        indices = {frame.name: frame.index for frame in frames if frame.index in learnable}
+        learned, seen = find_learned_images(added[0], len(topomap.summaries), indices, poor)
+        added = added if learned == learnable else add_frames(learned)
+    counts = {"poorly_recognised": len(poor), "learned": len(learned)}
+    return added, counts | seen if poor else {}
 
 
 def add_session(
