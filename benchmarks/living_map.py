@@ -8,10 +8,10 @@ that do not.
 `topoloc build` maps MAP_SEQ by its own poses; each WALK then joins by `topoloc update`: of stereo
 or RGB-D by `--trajectory` (slam, as a user has it who carries a camera and nothing else), of a
 single camera by `--single` (map: the map's answers, truth: its own poses). WALK=LIGHT names the
-light. With `--prune` the map is pruned after each, with `--budget F` to F times the bytes of the map as it was built. Beside it stand the
-map never updated and, with `--unlimited`, the same map that is never pruned. `--settings` are those
-of `update` and `prune`: with `min_inliers = 10000` in the table `[update]` every picture of a
-session becomes a node, so that a budget binds.
+light. With `--prune` the map is pruned after each, with `--budget F` to F times the bytes of the
+map as it was built. Beside it stand the map never updated and, with `--unlimited`, the same map
+that is never pruned. `--settings` are those of `update` and `prune`: with `min_inliers = 10000` in
+the table `[update]` every picture of a session becomes a node, so that a budget binds.
 
 Printed for each walk: bytes, nodes, processor time and the memory at most of `update` and of
 `prune`; with `--alone` what building the walk alone takes. At the end (with `--ask-each` after each
