@@ -16,7 +16,7 @@ import numpy as np
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.session_poses import SessionPoses
 from topoloc.mapping.node_drafts import observe_node
-from topoloc.mapping.nodes import find_nearest_nodes
+from topoloc.mapping.nodes import find_nearest_nodes, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row
 
@@ -25,18 +25,15 @@ def find_poorly_recognised(topomap: TopoMetricMap, session_poses: SessionPoses) 
     """Return the queried frames with a pose that see surfaces of the map, of which the map
     recognises little."""
     min_inliers = 150  # an image with more is localized in all likelihood from beside it, too
-    reach, max_turn_deg = 4.0, 30.0  # to the nearest node: in D_thresh, and degrees
-    nodes, found = topomap.node_poses, set[int]()
-    for index, answer in session_poses.answers.items():
-        pose = session_poses.world_from_cams.get(index)
-        if pose is not None and (answer is None or answer.num_inliers < min_inliers):
-            metres = np.linalg.norm(nodes.centres - pose.translation, axis=1)
-            is_along = nodes.rotations[:, :, 2] @ pose.rotation[:, 2] > np.cos(
-                np.radians(max_turn_deg)
-            )
-            if (is_along & (metres <= reach * topomap.config.d_thresh)).any():
-                found.add(index)
-    return found
+    reach = 6.0  # to the nearest node by Eq. 1, in D_thresh
+    nodes, config = topomap.node_poses, topomap.config
+    return {
+        index
+        for index, answer in session_poses.answers.items()
+        if (pose := session_poses.world_from_cams.get(index)) is not None
+        and (answer is None or answer.num_inliers < min_inliers)
+        and node_distances(pose, nodes, config.lambda_rot).min() <= reach * config.d_thresh
+    }
 
 
 def select_learnable(

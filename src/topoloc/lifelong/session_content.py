@@ -125,14 +125,10 @@ def create_session_content(
     """Create the content of a session. Queried frames that the map localizes well observe its
     nodes. The others, and those in `learnt` (by index, `light_learning.py`), become nodes. Frames
     near a new node become mapping images."""
-    config, content = topomap.config, SessionContent()
+    config, content, d = topomap.config, SessionContent(), topomap.config.d_thresh
     by_index = {frame.index: frame for frame in frames}
     queried = {by_index[k]: one for k, one in session_poses.answers.items() if k in by_index}
-    weak = [
-        frame
-        for frame, answer in queried.items()
-        if frame.index in learnt or not is_well_localized(answer, config.d_thresh)
-    ]
+    weak = [f for f, a in queried.items() if f.index in learnt or not is_well_localized(a, d)]
     drafts = _draft_nodes(topomap, MapPointLocator(frames, topomap, learnt), weak, progress)
     drafted = {draft.frame: draft.image for draft in drafts}
     covered = queried.keys() - drafted.keys()

@@ -3,8 +3,9 @@
 The session's poses in the map are estimated first (`session_poses.py`). If the map localizes an
 image well, only its observations of existing landmarks are counted. These counts later show which
 landmarks have vanished. Otherwise (new places, other light, a changed room) the session's images
-become nodes, as in a new map. The images around them are added to the coarse localizers. Existing
-content of the map is neither changed nor removed.
+become nodes, as in a new map. The images around them are added to the coarse localizers. Nothing
+that the map had is moved. Nodes of another light (`light_learning.py`) take the room of landmarks
+that are seen least.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
 from topoloc.tracking.tracker import Tracker
 
-_Added = tuple[TopoMetricMap, SessionContent, list[str]]
-"""The map with a session, the content of it, and the coarse localizers that were not updated."""
+_Added = tuple[SessionContent, TopoMetricMap, list[str]]
+"""The content of a session, the map with it, and the coarse localizers that were not updated."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,12 +176,12 @@ def update_map(
         content = create_session_content(topomap, frames, session_poses, progress, learnt)
         camera = sequence[frames[0].index].camera
         session = create_session(sequence, frames, poses_from, camera, content.lights)
-        changed = add_session(topomap, session, frames, content)
-        changed, not_updated = update_coarse_models(changed, content.views, content.images)
-        return changed, content, not_updated
+        added = add_session(topomap, session, frames, content), content.views, content.images
+        return content, *update_coarse_models(*added)
 
-    added, learning = _learn_light(topomap, sequence.poses, frames, session_poses, add_frames)
-    changed, content, not_updated = added
+    (content, changed, not_updated), learning = _learn_light(
+        topomap, sequence.poses, frames, session_poses, add_frames
+    )
     changes = {
         "session": frames[0].session_id,
         "recording": sequence.name,
@@ -216,7 +217,7 @@ def _learn_light(
     added, learned, seen = add_frames(learnable), learnable, dict[str, int]()
     if learnable:
         indices = {frame.name: frame.index for frame in frames if frame.index in learnable}
-        learned, seen = find_learned_images(added[0], len(topomap.summaries), indices, poor)
+        learned, seen = find_learned_images(added[1], len(topomap.summaries), indices, poor)
         added = added if learned == learnable else add_frames(learned)
     counts = {"poorly_recognised": len(poor), "learned": len(learned)}
     return added, counts | seen if poor else {}
