@@ -232,18 +232,15 @@ def describe_update(changes: dict[str, Any]) -> str:
 
 def describe_learning(changes: dict[str, Any]) -> str:
     """Return what the map learned of images that it recognises poorly, if there are any."""
-    if not (num := changes.get("poorly_recognised")):
-        return ""
-    if "landmarks_of_map_seen" not in changes:
-        fault, remedy = "its poses do not agree with the map", "give better ones, or none"
-        return f"; {num} poorly recognised images taught it nothing: {fault}; {remedy}"
-    of_map, of_others = changes["landmarks_of_map_seen"], changes["landmarks_of_each_other_seen"]
-    seen = f"they show {of_others} landmarks of each other, {of_map} of the map before"
-    if learned := changes["learned"]:
-        room = f"{changes.get('landmarks_dropped', 0)} landmarks that are seen least made room"
-        return f"; it learned the light of {learned} images: {seen}; {room}"
-    remedy = "record the place in this light again, with images closer together"
-    return f"; {num} poorly recognised images taught it nothing: {seen}; {remedy}"
+    c, why, remedy = changes, "its poses do not agree with the map", "give better ones, or none"
+    if (of_others := c.get("landmarks_of_each_other_seen")) is not None:
+        of_map, remedy = c["landmarks_of_map_seen"], "record more images there in this light"
+        why = f"they show {of_others} landmarks of each other, {of_map} of the map before"
+    if c.get("learned"):
+        room = f"{c.get('landmarks_dropped', 0)} landmarks that are seen least made room"
+        return f"; it learned the light of {c['learned']} images: {why}; {room}"
+    poor = f"; {c.get('poorly_recognised')} poorly recognised images taught it nothing"
+    return f"{poor}: {why}; {remedy}" if c.get("poorly_recognised") else ""
 
 
 def describe_outdated_models(changes: dict[str, Any]) -> str:
