@@ -14,6 +14,7 @@ import topoloc.demo
 from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.apps.cli import main
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.lifelong.single_camera_poses import localize_between
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
@@ -128,3 +129,25 @@ def test_images_that_show_nothing_where_their_poses_predict_it_teach_nothing(
     said = capsys.readouterr().out
     assert "0 nodes added" in said
     assert "poorly recognised images taught it nothing: they show" in said
+
+
+def test_an_image_is_looked_for_between_its_neighbours(by_day: Path):
+    """A frame that is not there has an answer only if the map finds it near the middle."""
+    walk = open_sequence(LAB / "day")
+    with TopoMetricMap.load(by_day) as topomap:
+        localizer = Localizer(topomap)
+        answers = dict[int, Localization]()
+        for k in (0, 2, 20):
+            result = localizer.localize(walk[k].image, walk[k].camera)
+            assert isinstance(result, Localization)
+            answers[k] = result
+        for ends, is_found in (((0, 2), True), ((2, 2), False), ((0, 20), False)):
+            known = {
+                2 * k: (answers[end].world_from_cam, answers[end]) for k, end in enumerate(ends)
+            }
+            localize_between(walk[0:3], localizer, known)
+            assert (1 in known) == is_found
+            if is_found:
+                true = walk[1].world_from_cam
+                assert true is not None
+                assert np.linalg.norm(known[1][0].translation - true.translation) < 0.01

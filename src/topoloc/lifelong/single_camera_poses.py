@@ -121,11 +121,11 @@ def _localize_stream(
             f"{sequence.name}: the map recognises {len(localized)} of its {len(sequence)} pictures:"
             " too few to join"
         )
-    _localize_between(sequence, tracker.localizer, localized)
+    localize_between(sequence, tracker.localizer, localized)
     return localized, odometry
 
 
-def _localize_between(
+def localize_between(
     sequence: StereoSequence,
     localizer: Localizer,
     localized: dict[int, tuple[Rigid3, Localization]],
