@@ -2,16 +2,16 @@
 that do not.
 
     python benchmarks/living_map.py MAP_SEQ [WALK ...] --ask NAME=SEQ [NAME=SEQ ...] [--step 1]
-        [--trajectory slam] [--prune] [--budget 1.5] [--unlimited] [--alone] [--ask-each]
-        [--features surf,topoloc-net] [--settings FILE.toml]
+        [--trajectory slam] [--single map] [--prune] [--budget 1.5] [--unlimited] [--alone]
+        [--ask-each] [--features surf,topoloc-net] [--settings FILE.toml]
 
 `topoloc build` maps MAP_SEQ by its own poses; each WALK then joins by `topoloc update`: of stereo
 or RGB-D by `--trajectory` (slam, as a user has it who carries a camera and nothing else), of a
-single camera by the map's answers. WALK=LIGHT names the light. With `--prune` the map is pruned
-after each, with `--budget F` to F times the bytes of the map as it was built. Beside it stand the
-map never updated and, with `--unlimited`, the same map that is never pruned. `--settings` are those
-of `update` and `prune`: with `min_inliers = 10000` in the table `[update]` every picture of a
-session becomes a node, so that a budget binds.
+single camera by `--single` (map: the map's answers, truth: its own poses). WALK=LIGHT names the
+light. With `--prune` the map is pruned after each, with `--budget F` to F times the bytes of the
+map as it was built. Beside it stand the map never updated and, with `--unlimited`, the same map
+that is never pruned. `--settings` are those of `update` and `prune`: with `min_inliers = 10000` in
+the table `[update]` every picture of a session becomes a node, so that a budget binds.
 
 Printed for each walk: bytes, nodes, processor time and the memory at most of `update` and of
 `prune`; with `--alone` what building the walk alone takes. At the end (with `--ask-each` after each
@@ -133,13 +133,14 @@ class LivingMap:
     def join(self, walk: str) -> None:
         path, _, light = walk.partition("=")
         first = open_sequence(path)[0]
-        trajectory = "map" if first.right is None and first.depth is None else self.args.trajectory
+        is_single = first.right is None and first.depth is None
+        trajectory = self.args.single if is_single else self.args.trajectory
         words = ["--trajectory", trajectory, *(["--light", light] if light else []), *self.settings]
         costs = list[Cost]()
         for topo in self.updated:
             costs.append(run("update", topo, path, *words))
             self.say(f"{topo.stem} + {path} by {trajectory}: {costs[-1]}; {size(topo)}")
-        if self.args.alone and trajectory != "map":
+        if self.args.alone and not is_single:
             alone = run(
                 "build",
                 path,
@@ -175,6 +176,7 @@ def main() -> None:
     parser.add_argument("--ask", nargs="+", default=[], metavar="NAME=SEQ")
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--trajectory", default="slam")
+    parser.add_argument("--single", default="map")
     parser.add_argument("--features")
     parser.add_argument("--settings", type=Path)
     parser.add_argument("--prune", action="store_true")

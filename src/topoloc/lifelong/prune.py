@@ -154,7 +154,7 @@ def prune_map(
     counted = transform_nodes(topomap, _merge_session_counts)
     if descriptors == "coarse":
         counted = transform_nodes(counted, partial(quantize_node_descriptors, step=descriptor_step))
-    is_same = counted is topomap
+    is_same = counted is topomap and topomap.file is not None
     file = _FileSize.of(path, topomap.kinds) if is_same else _measure_file_size(counted, path)
     fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes)
     file = file if fewer is counted else _measure_file_size(fewer, path)

@@ -7,7 +7,7 @@ k-NN localizers receive new vectors. Their vocabulary or network stays the same.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from topoloc.errors import MissingExtraError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import position_covariance
+from topoloc.lifelong.map_depth import MapPointLocator
 from topoloc.lifelong.session_poses import SessionPoses
 from topoloc.localization.result import Localization
 from topoloc.mapping.config import Progress
@@ -119,14 +120,16 @@ def create_session_content(
     frames: Sequence[MappingFrame],
     session_poses: SessionPoses,
     progress: Progress,
+    learnt: Collection[int] = (),
 ) -> SessionContent:
     """Create the content of a session. Queried frames that the map localizes well observe its
-    nodes, the others become nodes. Frames near a new node become mapping images."""
-    config, content = topomap.config, SessionContent()
+    nodes. The others, and those in `learnt` (by index, `light_learning.py`), become nodes. Frames
+    near a new node become mapping images."""
+    config, content, d = topomap.config, SessionContent(), topomap.config.d_thresh
     by_index = {frame.index: frame for frame in frames}
     queried = {by_index[k]: one for k, one in session_poses.answers.items() if k in by_index}
-    weak = [f for f, answer in queried.items() if not is_well_localized(answer, config.d_thresh)]
-    drafts = _draft_nodes(topomap, PointLocator(frames, config), weak, progress)
+    weak = [f for f, a in queried.items() if f.index in learnt or not is_well_localized(a, d)]
+    drafts = _draft_nodes(topomap, MapPointLocator(frames, topomap, learnt), weak, progress)
     drafted = {draft.frame: draft.image for draft in drafts}
     covered = queried.keys() - drafted.keys()
     new = NodePoses.of([image.world_from_cam for image in drafted.values()])
@@ -156,7 +159,10 @@ def create_session_content(
                     content.views[kind].append((features, image.camera, node_id))
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
-        content.nodes[kind] = [finish_node(*one, kind) for one in zip(new_ids, drafts, strict=True)]
+        content.nodes[kind] = [
+            finish_node(node_id, draft, kind, 400 if draft.frame.index in learnt else 800)
+            for node_id, draft in zip(new_ids, drafts, strict=True)
+        ]
     for node_id, draft in zip(new_ids, drafts, strict=True):
         content.sides.extend(
             replace(side, summary=replace(side.summary, of_node=node_id)) for side in draft.sides

@@ -34,6 +34,7 @@ from topoloc.lifelong.session_poses import (
     align_motion_to_map,
 )
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory, correct_trajectory
+from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig, Progress
 from topoloc.mapping.nodes import select_node_frames
@@ -120,7 +121,27 @@ def _localize_stream(
             f"{sequence.name}: the map recognises {len(localized)} of its {len(sequence)} pictures:"
             " too few to join"
         )
+    localize_between(sequence, tracker.localizer, localized)
     return localized, odometry
+
+
+def localize_between(
+    sequence: StereoSequence,
+    localizer: Localizer,
+    localized: dict[int, tuple[Rigid3, Localization]],
+) -> None:
+    """Add to `localized` each frame between two localized ones that the map finds between them.
+    Alone it looked like several places, or like none."""
+    for index in range(1, len(sequence) - 1):
+        before, after = localized.get(index - 1), localized.get(index + 1)
+        if index not in localized and before is not None and after is not None:
+            frame, half_way = sequence[index], before[0].interpolate(after[0], 0.5)
+            result = localizer.localize(frame.image, frame.camera, half_way)
+            gap_m = float(np.linalg.norm(before[0].translation - after[0].translation))
+            if isinstance(result, Localization) and result.world_from_cam.is_same(
+                half_way, 0.5 * gap_m, math.pi
+            ):
+                localized[index] = result.world_from_cam, result
 
 
 def _failure_reason(localized: Mapping[int, Localization]) -> str:

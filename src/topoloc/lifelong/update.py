@@ -3,26 +3,36 @@
 The session's poses in the map are estimated first (`session_poses.py`). If the map localizes an
 image well, only its observations of existing landmarks are counted. These counts later show which
 landmarks have vanished. Otherwise (new places, other light, a changed room) the session's images
-become nodes, as in a new map. The images around them are added to the coarse localizers. Existing
-content of the map is neither changed nor removed.
+become nodes, as in a new map. The images around them are added to the coarse localizers. Nothing
+that the map had is moved. Nodes of another light (`light_learning.py`) take the room of landmarks
+that are seen least.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from topoloc.errors import MapError
+from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
+from topoloc.lifelong.light_learning import (
+    find_learned_images,
+    find_poorly_recognised,
+    select_learnable,
+)
 from topoloc.lifelong.node_localization import measure_recall_change
+from topoloc.lifelong.prune import prune_map
 from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
     SessionContent,
     create_session_content,
     update_coarse_models,
 )
-from topoloc.lifelong.session_poses import estimate_poses_by_motion
+from topoloc.lifelong.session_poses import SessionPoses, estimate_poses_by_motion
 from topoloc.lifelong.single_camera_poses import estimate_poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
@@ -47,6 +57,9 @@ from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
 from topoloc.tracking.tracker import Tracker
+
+_Added = tuple[SessionContent, TopoMetricMap, list[str]]
+"""The content of a session, the map with it, and the coarse localizers that were not updated."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,13 +131,17 @@ def update(
             if is_checked:
                 check_poses(posed)
         updated = update_map(edit.topomap, posed, poses_from, localizer_config, progress)
-        changes = updated.changes | {"bytes_before": edit.path.stat().st_size}
-        topomap = updated.topomap
+        before = edit.path.stat().st_size
+        changes, topomap = updated.changes | {"bytes_before": before}, updated.topomap
+        if changes.get("learned"):
+            with suppress(MapError):  # a map of few landmarks grows
+                topomap, dropped = prune_map(topomap, edit.path, before)
+                changes |= {name: dropped[name] for name in ("nodes_dropped", "landmarks_dropped")}
         if light is not None:
             *others, last = topomap.sessions
             topomap = replace(topomap, sessions=[*others, replace(last, light_name=light)])
         edit.commit(topomap, f"update {sequence.name}", changes)
-    return replace(updated, changes=changes | {"bytes": Path(path).stat().st_size})
+    return replace(updated, topomap=topomap, changes=changes | {"bytes": Path(path).stat().st_size})
 
 
 def update_map(
@@ -154,13 +171,19 @@ def update_map(
     poses = [session_poses.world_from_cams.get(index) for index in indices]
     posed_sequence = SequenceView(sequence, indices, poses)
     frames = select_posed_frames(posed_sequence, topomap.free_ids.session)
-    content = create_session_content(topomap, frames, session_poses, progress)
-    camera = sequence[frames[0].index].camera
-    session = create_session(sequence, frames, poses_from, camera, content.lights)
-    changed = add_session(topomap, session, frames, content)
-    changed, not_updated = update_coarse_models(changed, content.views, content.images)
+
+    def add_frames(learnt: Collection[int]) -> _Added:
+        content = create_session_content(topomap, frames, session_poses, progress, learnt)
+        camera = sequence[frames[0].index].camera
+        session = create_session(sequence, frames, poses_from, camera, content.lights)
+        added = add_session(topomap, session, frames, content), content.views, content.images
+        return content, *update_coarse_models(*added)
+
+    (content, changed, not_updated), learning = _learn_light(
+        topomap, sequence.poses, frames, session_poses, add_frames
+    )
     changes = {
-        "session": session.session_id,
+        "session": frames[0].session_id,
         "recording": sequence.name,
         "frames": len(sequence),
         "frames_with_pose": len(frames),
@@ -174,10 +197,30 @@ def update_map(
         "points_added": sum(len(node.features) for node in content.nodes[topomap.kind]),
         "place_images_added": len(content.images),
         "not_taught": not_updated,
-    }
+    } | learning
     changed = with_map_statistics(changed, progress)
     recall = measure_recall_change(topomap, changed, localizer_config)
     return MapUpdate(changed, posed_sequence, changes | recall)
+
+
+def _learn_light(
+    topomap: TopoMetricMap,
+    motion: Sequence[Rigid3 | None],
+    frames: Sequence[MappingFrame],
+    session_poses: SessionPoses,
+    add_frames: Callable[[Collection[int]], _Added],
+) -> tuple[_Added, dict[str, int]]:
+    """Return what `add_frames` adds with those images as nodes that teach the map another light,
+    and their numbers by the names of the map's history, none if the map recognises all well."""
+    poor = find_poorly_recognised(topomap, session_poses)
+    learnable = select_learnable(poor, motion, session_poses, topomap.config.d_thresh)
+    added, learned, seen = add_frames(learnable), learnable, dict[str, int]()
+    if learnable:
+        indices = {frame.name: frame.index for frame in frames if frame.index in learnable}
+        learned, seen = find_learned_images(added[1], len(topomap.summaries), indices, poor)
+        added = added if learned == learnable else add_frames(learned)
+    counts = {"poorly_recognised": len(poor), "learned": len(learned)}
+    return added, counts | seen if poor else {}
 
 
 def add_session(

@@ -3,6 +3,7 @@ Also describe its contents in numbers and words."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict
@@ -46,6 +47,7 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
         raise EmptyMapError(f"map {path} has no nodes")
     models = list_coarse_models(path)
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
+    num_nodes = Counter(summary.session_id for summary in topomap.summaries)
     return {
         "path": str(path),
         "map": topomap.id,
@@ -66,6 +68,7 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
                 "camera": None if session.camera is None else session.camera.to_json(),
                 "start_date": session.start_date,
                 "end_date": session.end_date,
+                "num_nodes": num_nodes[session.session_id],
             }
             for session in topomap.sessions
         ],

@@ -90,6 +90,7 @@ def _print(info: dict[str, Any]) -> None:
     extent = " x ".join(f"{e:.1f}" for e in info["extent_m"])
     d_thresh, lambda_rot = (nodes.get(name, nan) for name in ("d_thresh", "lambda_rot"))
     kinds = ", ".join(info["kinds"]) + (f", normalization {normalization}" * bool(normalization))
+    of_sessions = [f"{one['name']} ({one['num_nodes']} nodes)" for one in info["sessions"]]
     print_fields(
         [
             ("map", info["path"]),
@@ -99,7 +100,7 @@ def _print(info: dict[str, Any]) -> None:
             ("side nodes", str(info["num_side_nodes"])),
             ("place images", str(info["num_place_images"])),
             ("mapped", f"{info['length_m']:.1f} m, extent {extent} m"),
-            ("recordings", ", ".join(info["recordings"])),
+            ("recordings", ", ".join(of_sessions or info["recordings"])),
             ("on earth", place),
             *(
                 ("coarse localizer", _format_coarse(facts, info["default_coarse"]))

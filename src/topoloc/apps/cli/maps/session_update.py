@@ -226,7 +226,21 @@ def describe_update(changes: dict[str, Any]) -> str:
     localized = f"{c['localized']} of {c['asked']} images were localized"
     size = f"{c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB"
     added = f"{c['nodes_added']} nodes added"
-    return f"{seen}, {localized}, {added}, {size}{describe_outdated_models(changes)}"
+    more = f"{describe_learning(changes)}{describe_outdated_models(changes)}"
+    return f"{seen}, {localized}, {added}, {size}{more}"
+
+
+def describe_learning(changes: dict[str, Any]) -> str:
+    """Return what the map learned of images that it recognises poorly, if there are any."""
+    c, why, remedy = changes, "its poses do not agree with the map", "give better ones, or none"
+    if (of_others := c.get("landmarks_of_each_other_seen")) is not None:
+        of_map, remedy = c["landmarks_of_map_seen"], "record more images there in this light"
+        why = f"they show {of_others} landmarks of each other, {of_map} of the map before"
+    if c.get("learned"):
+        room = f"{c.get('landmarks_dropped', 0)} landmarks that are seen least made room"
+        return f"; it learned the light of {c['learned']} images: {why}; {room}"
+    poor = f"; {c.get('poorly_recognised')} poorly recognised images taught it nothing"
+    return f"{poor}: {why}; {remedy}" if c.get("poorly_recognised") else ""
 
 
 def describe_outdated_models(changes: dict[str, Any]) -> str:
