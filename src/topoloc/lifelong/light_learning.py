@@ -25,7 +25,7 @@ def find_poorly_recognised(topomap: TopoMetricMap, session_poses: SessionPoses) 
     """Return the queried frames with a pose that see surfaces of the map, of which the map
     recognises little."""
     min_inliers = 150  # an image with more is localized in all likelihood from beside it, too
-    reach = 6.0  # to the nearest node by Eq. 1, in D_thresh
+    reach = 4.0  # to the nearest node by Eq. 1, in D_thresh: farther ones show other surfaces
     nodes, config = topomap.node_poses, topomap.config
     return {
         index
@@ -74,35 +74,46 @@ def find_learned_images(
     that it was before (the first `num_old` nodes), and for landmarks of the other images.
 
     Return the frames that stay and the numbers of recognised landmarks by the names of the map's
-    history. All stay or none, as the frames `poor` tell, but those that contradict their poses.
+    history. All stay or none, as the frames `poor` tell, but those that contradict their poses. Of
+    the landmarks in view, they must show a larger share of each other's than of the map's: at its
+    borders the map has few landmarks, but shows them as well as everywhere.
     """
     min_gain = 1.25  # images in the map's own light show less of each other than of the map
     min_recognised = 30  # landmarks that an image shows where its pose predicts them
     new = [row for row in changed.rows[num_old:] if changed.summaries[row].name in indices]
-    by_map, by_others, learned = 0, 0, set[int]()
+    by_map, by_others, learned = np.zeros(2, int), np.zeros(2, int), set[int]()
     for row in new:
         index, others = indices[changed.summaries[row].name], [one for one in new if one != row]
         of_map = _count_recognised(changed, row, changed.rows[:num_old])
         of_others = _count_recognised(changed, row, others)
-        if max(of_map, of_others) >= min_recognised:
+        if max(of_map[0], of_others[0]) >= min_recognised:
             learned.add(index)
             if index in poor:
                 by_map, by_others = by_map + of_map, by_others + of_others
-    is_learned = by_others > min_gain * by_map
-    seen = {"landmarks_of_map_seen": by_map, "landmarks_of_each_other_seen": by_others}
-    return learned if is_learned else set(), seen
+    of_map, of_others = (seen / max(in_view, 1) for seen, in_view in (by_map, by_others))
+    seen = {
+        "landmarks_of_map_seen": int(by_map[0]),
+        "landmarks_of_each_other_seen": int(by_others[0]),
+    }
+    return learned if of_others > min_gain * of_map else set(), seen
 
 
-def _count_recognised(topomap: TopoMetricMap, row: Row, known: Sequence[Row]) -> int:
+def _count_recognised(topomap: TopoMetricMap, row: Row, known: Sequence[Row]) -> tuple[int, int]:
     """Return how many landmarks the image of a node shows of one of the two nearest nodes among
-    `known`, the better one."""
-    pose, poses = topomap.summaries[row].world_from_cam, topomap.node_poses.rows(known)
+    `known`, the better one, and how many of that are in view."""
+    summary, image = topomap.summaries[row], topomap.first_layer.nodes[row].camera
+    pose, poses = summary.world_from_cam, topomap.node_poses.rows(known)
 
-    def count(other: Row) -> int:
+    def count(other: Row) -> tuple[int, int]:
         cam_from_node = pose.inverse() @ topomap.summaries[other].world_from_cam
-        pairs = [(layer.nodes[other], layer.nodes[row]) for layer in topomap.layers.values()]
-        seen = (observe_node(a, b.features, b.camera, cam_from_node) for a, b in pairs)
-        return sum(len(one.rows) for one in seen)
+        num_seen, num_in_view = 0, 0
+        for layer in topomap.layers.values():
+            node, features = layer.nodes[other], layer.nodes[row].features
+            num_seen += len(observe_node(node, features, image, cam_from_node).rows)
+            points = cam_from_node.apply(node.points_cam.astype(np.float64))
+            is_seen = (points[:, 2] > 0.0) & image.is_in_image(image.img_from_cam(points))
+            num_in_view += int(np.count_nonzero(is_seen))
+        return num_seen, num_in_view
 
     nearest = find_nearest_nodes(pose, poses, topomap.config.lambda_rot, 2) if known else []
-    return max((count(known[k]) for k in nearest), default=0)
+    return max((count(known[k]) for k in nearest), default=(0, 0))

@@ -87,7 +87,7 @@ class _FileSize:
         )
 
 
-def _measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
+def measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
     """Write the map to a temporary file beside `path` and measure it. Raises MapError."""
     try:
         with temporary_file(path) as tried:
@@ -155,9 +155,9 @@ def prune_map(
     if descriptors == "coarse":
         counted = transform_nodes(counted, partial(quantize_node_descriptors, step=descriptor_step))
     is_same = counted is topomap and topomap.file is not None
-    file = _FileSize.of(path, topomap.kinds) if is_same else _measure_file_size(counted, path)
+    file = _FileSize.of(path, topomap.kinds) if is_same else measure_file_size(counted, path)
     fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes)
-    file = file if fewer is counted else _measure_file_size(fewer, path)
+    file = file if fewer is counted else measure_file_size(fewer, path)
     return _prune_landmarks(topomap, fewer, path, file, max_bytes)
 
 
@@ -223,7 +223,7 @@ def _prune_landmarks(
         pruned, changes = _drop_landmarks(topomap, vanished, most)
         written = 0
         if max_bytes is not None:
-            written = _measure_file_size(pruned, path).size + _PAGE_SLACK_BYTES
+            written = measure_file_size(pruned, path).size + _PAGE_SLACK_BYTES
         if max_bytes is None or written <= max_bytes:
             changes = {"nodes_dropped": num_nodes} | changes
             return pruned, changes | measure_recall_change(before, pruned)

@@ -10,7 +10,7 @@ that are seen least.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from topoloc.lifelong.light_learning import (
     select_learnable,
 )
 from topoloc.lifelong.node_localization import measure_recall_change
-from topoloc.lifelong.prune import prune_map
+from topoloc.lifelong.prune import measure_file_size, prune_map
 from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
     SessionContent,
@@ -135,7 +135,8 @@ def update(
         changes, topomap = updated.changes | {"bytes_before": before}, updated.topomap
         if changes.get("learned"):
             with suppress(MapError):  # a map of few landmarks grows
-                topomap, dropped = prune_map(topomap, edit.path, before)
+                limit = _limit_size(topomap, edit.path, changes)
+                topomap, dropped = prune_map(topomap, edit.path, limit)
                 changes |= {name: dropped[name] for name in ("nodes_dropped", "landmarks_dropped")}
         if light is not None:
             *others, last = topomap.sessions
@@ -201,6 +202,15 @@ def update_map(
     changed = with_map_statistics(changed, progress)
     recall = measure_recall_change(topomap, changed, localizer_config)
     return MapUpdate(changed, posed_sequence, changes | recall)
+
+
+def _limit_size(topomap: TopoMetricMap, path: Path, changes: Mapping[str, int]) -> int:
+    """Return the bytes of the map without its learned nodes. Other landmarks make room for these,
+    but at most a fifth."""
+    max_share = 0.2
+    before, size = changes["bytes_before"], measure_file_size(topomap, path).size
+    of_learned = (size - before) * changes["learned"] / changes["nodes_added"]
+    return round(size - min(of_learned, max_share * before))
 
 
 def _learn_light(
