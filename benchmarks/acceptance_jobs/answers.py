@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from topoloc.localization.exact.appearance import share_of_this_floor
+
 TOLERANCE = 1e-6
 KEPT = ("query", "localized", "reason", "tile", "node", "probability", "world_from_cam")
 
@@ -24,8 +26,13 @@ class Comparison:
 
 
 def kept(answers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the answers with only those keys that are compared."""
-    return [{key: answer[key] for key in KEPT if key in answer} for answer in answers]
+    """Return the answers with only those keys that are compared. The probability is that without
+    the appearance, which old commits did not know."""
+    found = [{key: answer[key] for key in KEPT if key in answer} for answer in answers]
+    for one, answer in zip(found, answers, strict=True):
+        if answer["localized"] and "appearance" in answer:
+            one["probability"] /= share_of_this_floor(answer["appearance"], False)
+    return found
 
 
 def compare_answers(
