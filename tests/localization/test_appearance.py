@@ -34,6 +34,15 @@ def lab() -> TopoMetricMap:
     return built_lab()
 
 
+def test_an_uncalibrated_image_is_compared_by_the_estimated_camera(lab: TopoMetricMap):
+    localizer = Localizer(lab)
+    for frame in _unseen():
+        found = localizer.localize(frame.image, None)
+        assert isinstance(found, Localization)
+        assert found.appearance is not None
+        assert found.appearance > 0.99
+
+
 def _with_look_alikes(lab: TopoMetricMap) -> TopoMetricMap:
     return replace(lab, config=replace(lab.config, look_alike_floors=True))
 

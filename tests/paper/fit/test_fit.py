@@ -46,6 +46,7 @@ TRUE = EvidenceWeights(
     doubt=-0.5,
     bias=7.0,
     clear_log_odds=4.5,
+    narrow_spread=0.0,
 )
 PRIOR = structs.replace(TRUE, even_share=1.0, inliers=1.0, bias=4.0)
 RIGHT, WRONG, BETWEEN = (0.01, 0.2), (3.0, 5.0), (0.3, 5.0)

@@ -88,7 +88,8 @@ class ColourAgreement:
 def compare_colours(search: Search, found: Localization) -> ColourAgreement | None:
     """Compare the colours of the points in view. None: an image is grey, or few points are."""
     weights, query, topomap = load_appearance_weights(), search.query, search.map.topomap
-    camera, in_query = query.camera, small_colours(query.image)
+    # an uncalibrated camera is estimated with the pose
+    camera, in_query = found.provenance.camera or query.camera, small_colours(query.image)
     if in_query is None:
         return None
     # the nodes near a pose beside a bend look past its walls; those of its inliers do not
