@@ -99,9 +99,8 @@ def _logistic_regression(
         float(weight)
         for weight in np.round(minimize(loss, start, bounds=bounds, method="L-BFGS-B").x, 3)
     )
-    return EvidenceWeights(
-        *fitted, doubt=prior.doubt, bias=bias, clear_log_odds=prior.clear_log_odds
-    )
+    names = ("even_share", "chance", "inliers", "inlier_share", "spread")
+    return replace(prior, **dict(zip(names, fitted, strict=True)), bias=bias)
 
 
 def try_on_others(
