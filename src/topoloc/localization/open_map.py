@@ -110,6 +110,10 @@ class OpenMap:
         """Return the points of these nodes, pooled."""
         return LocalMap.concatenate(self._local_map.pool(rows))
 
+    def descriptors(self, row: Row) -> Float32[np.ndarray, "n d"]:
+        """Return the descriptors of a node's points."""
+        return self._local_map(row).descriptors
+
     def template(self, node_id: NodeId) -> NodeTemplate:
         """Return the image of a node."""
         return self._template(self.topomap.row_of(node_id))

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Float32
 
+from topoloc.features.features import Features
 from topoloc.localization.proposals.propose import create_matcher, match_and_fit
 from topoloc.localization.refine import NodeProposal
 from topoloc.localization.search import Search
@@ -20,10 +21,15 @@ from topoloc.node_ids import Row
 
 
 def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
-    """Propose a pose in each place with many votes, most votes first."""
+    """Propose a pose in each place with many votes, most votes first.
+
+    An image of another place costs no votes: its retrieved nodes agree by chance only.
+    """
+    least, config = float(search.config.num_chance_inliers), search.config
+    if search.num_retrieved < least:
+        return
     with search.query.clock.stage("coarse"):
         places = list(find_places(search))
-    least, config = float(search.config.num_chance_inliers), search.config
     for rows in places:
         matcher = create_matcher(search, rows)
         proposal = match_and_fit(search, "votes", matcher, least, config.num_first_features)
@@ -61,11 +67,12 @@ def count_votes(
     max_lag = 0.02  # similarity: a node this near to the nearest one shows the feature, too
     query = search.query
     ranked = search.map.coarse.rank(query.image, query.features, max_nodes)
-    rows = [one.row for one in ranked if len(search.map.local_map([one.row]).radii)]
+    points = {one.row: search.map.descriptors(one.row) for one in ranked}
+    rows = [row for row, of_node in points.items() if len(of_node)]
     if not rows or not len(query.features):
         return [], np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     apart = _distances_between(search, rows)
-    similarities = _best_similarities(search, rows)
+    similarities = _best_similarities(query.features, [points[row] for row in rows])
     nearest, largest = similarities.argmax(axis=0), similarities.max(axis=0)
     elsewhere = np.where(apart[:, nearest] > 2.0, similarities, -1.0).max(axis=0)
     # where no node is elsewhere, a feature leads over none
@@ -83,10 +90,11 @@ def _distances_between(search: Search, rows: list[Row]) -> Float[np.ndarray, "no
     return metres / (3.0 * search.map.d_thresh) + angles / 0.5
 
 
-def _best_similarities(search: Search, rows: list[Row]) -> Float32[np.ndarray, "nodes features"]:
+def _best_similarities(
+    features: Features, points: list[Float32[np.ndarray, "n d"]]
+) -> Float32[np.ndarray, "nodes features"]:
     """Return the largest similarity of a point of each node to each of the strongest features."""
-    num_features = 96
-    parts = [search.map.local_map([row]).descriptors for row in rows]
-    firsts = np.cumsum([0, *(len(part) for part in parts[:-1])])
-    described = search.query.features.descriptors[:num_features]
-    return np.maximum.reduceat(np.concatenate(parts) @ described.T, firsts, axis=0)
+    num_features = 64
+    firsts = np.cumsum([0, *(len(of_node) for of_node in points[:-1])])
+    found = np.concatenate(points) @ features.descriptors[:num_features].T
+    return np.maximum.reduceat(found, firsts, axis=0)
