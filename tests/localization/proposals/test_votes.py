@@ -29,6 +29,12 @@ def room(tiny_recording: Path) -> TopoMetricMap:
     return twice(built_room(tiny_recording), share_alike=0.02)
 
 
+@pytest.fixture
+def any_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Votes are asked even if the retrieved nodes agree by chance."""
+    monkeypatch.setattr(LocalizerConfig, "num_chance_inliers", 0)
+
+
 class OtherRoomFirst:
     """Rank the nodes of the second room before those of the first."""
 
@@ -40,6 +46,7 @@ class OtherRoomFirst:
         return [NodeScore(Row(row), float(row + 1)) for row in rows][:num_candidates]
 
 
+@pytest.mark.usefixtures("any_agreement")
 def test_votes_find_the_place_when_other_nodes_rank_first(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
@@ -56,6 +63,7 @@ def test_votes_find_the_place_when_other_nodes_rank_first(
     assert sum(isinstance(one, NotLocalized) for one in lost) >= len(views) // 2
 
 
+@pytest.mark.usefixtures("any_agreement")
 def test_votes_are_few_elsewhere_and_nodes_left_out_have_none(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
@@ -84,3 +92,11 @@ def test_votes_are_few_elsewhere_and_nodes_left_out_have_none(
 def test_a_blank_image_has_no_place(room: TopoMetricMap):
     blank = np.full((240, 320), 128, np.uint8)
     assert isinstance(Localizer(room).localize(blank, CAMERA), NotLocalized)
+
+
+def test_an_image_whose_retrieved_nodes_agree_by_chance_costs_no_votes(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(votes, "count_votes", lambda _: pytest.fail("votes were counted"))
+    for picture, _ in unseen_views(seed=1, step=4.0):
+        assert isinstance(Localizer(room).localize(picture, CAMERA), NotLocalized)
