@@ -36,7 +36,6 @@ import numpy as np
 
 from topoloc.localization import schedule
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.proposals.propose import propose_first
 from topoloc.localization.query import QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search, Trace
@@ -74,7 +73,8 @@ def timed(name: str, propose: Callable[..., Any]) -> Callable[..., Iterator[Any]
 
 def work(fast: bool, light: float) -> None:
     """Answer the questions of standard input, one line each: the map, a recording, an index."""
-    for name in (*SOURCES, "virtual_views"):
+    known = [one for one in (*SOURCES, "virtual_views") if hasattr(schedule, f"propose_{one}")]
+    for name in known:
         setattr(schedule, f"propose_{name}", timed(name, getattr(schedule, f"propose_{name}")))
     localizers, sequences = dict[str, Localizer](), dict[str, Any]()
     config = LocalizerConfig(exactness="fast" if fast else "best")
@@ -231,7 +231,7 @@ def fit(path: str, recordings: list[str], light: float) -> None:
             answer = ask(localizer, frame)
             searches = localizer.context.searches(query_image, StageClock(), float("inf"))
             for search in searches:
-                propose_first(search, None)
+                schedule.propose_first(search, None)
                 if answer["kind"] == "by nodes":
                     inliers[search.map.kind.name].append(search.num_retrieved)
             for search in searches:

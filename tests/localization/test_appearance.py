@@ -107,7 +107,7 @@ def test_a_map_with_look_alike_floors_refuses_other_colours_and_images_without_a
     assert painted.appearance < 0.5
     assert NotLocalized.from_json(painted.to_json("x")).appearance == painted.appearance
     assert isinstance(grey, NotLocalized)
-    assert "(appearance: there are none)" in grey.detail
+    assert "without colours in view" in grey.detail
     assert isinstance(_ask(lab, [to_grey(image)])[0], Localization)
 
 

@@ -168,9 +168,10 @@ class MapContext:
             isinstance(result, Localization)
             and result.probability < self.config.evidence.min_probability
         ):
-            seen = "there are none" if result.appearance is None else f"{result.appearance:.2g}"
-            why = "the shape agrees, but not the colours, as on another floor of the building"
-            result, poses = _refuse(result, "not_in_map", f"{why} (appearance: {seen})"), []
+            why = "without colours in view nothing tells the look-alike floors apart"
+            if (seen := result.appearance) is not None:
+                why = f"the shape agrees, but not the colours, as on another floor ({seen:.2g})"
+            result, poses = _refuse(result, "not_in_map", why), []
         return self.with_provenance(result, camera), [
             (self.with_provenance(one, camera), seen) for one, seen in poses
         ]

@@ -23,7 +23,7 @@ from topoloc.node_ids import Row
 def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
     """Propose a pose in each place with many votes, most votes first.
 
-    An image of another place costs no votes: its retrieved nodes agree by chance only.
+    They are not counted if the retrieved nodes agree by chance only, to refuse quickly.
     """
     least, config = float(search.config.num_chance_inliers), search.config
     if search.num_retrieved < least:
