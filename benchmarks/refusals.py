@@ -36,7 +36,7 @@ import numpy as np
 
 from topoloc.localization import schedule
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.query import QueryImage, StageClock
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search, Trace
 from topoloc.localization.walls.place_comparison import Comparison
@@ -229,7 +229,7 @@ def fit(path: str, recordings: list[str], light: float) -> None:
             assert frame.camera is not None
             query_image = QueryImage(frame.image, frame.camera)
             answer = ask(localizer, frame)
-            searches = localizer.context.searches(query_image, StageClock(), float("inf"))
+            searches = localizer.context.searches(query_image, StageClock(), Deadline())
             for search in searches:
                 schedule.propose_first(search, None)
                 if answer["kind"] == "by nodes":
