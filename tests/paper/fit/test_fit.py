@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec import structs
+from msgspec import json, structs
 
 from topoloc.localization.belief import RivalWeights
 from topoloc.localization.fitted_weights import (
@@ -138,6 +138,7 @@ def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
         0.35, abs=1e-6
     )
     assert fitted.bias < fit_evidence(poses, PRIOR, 0.1).bias - 1.0
+    assert json.decode(json.encode(fitted), type=EvidenceWeights) == fitted
 
 
 def test_every_family_is_judged_by_a_fit_without_it():
