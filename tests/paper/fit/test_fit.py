@@ -10,19 +10,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec import structs
+from msgspec import json, structs
 
 from topoloc.localization.belief import RivalWeights
 from topoloc.localization.fitted_weights import (
     CorrelatedErrorWeights,
     EvidenceWeights,
     FittedWeights,
+    NodeStop,
     compute_log_odds,
     load_fitted_weights,
     read_weights,
 )
+from topoloc.localization.localizer import Localizer
 from topoloc.localization.provenance import Evidence
+from topoloc.recordings.open import open_sequence
 from topoloc_paper.fit import __main__ as command
+from topoloc_paper.fit.corpus import AskedPlace
 from topoloc_paper.fit.evidence import (
     Judged,
     best_strength,
@@ -34,7 +38,7 @@ from topoloc_paper.fit.evidence import (
     try_on_others,
 )
 from topoloc_paper.fit.rivals import MIN_HARD_PAIRS, fit_rivals, num_mistaken, pairs_of
-from topoloc_paper.fit.tried_poses import TriedPose, load_poses, save_poses
+from topoloc_paper.fit.tried_poses import TriedPose, ask_place, load_poses, save_poses
 from topoloc_paper.fit.walls import MIN_POSES, fit_walls
 
 TRUE = EvidenceWeights(
@@ -138,6 +142,7 @@ def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
         0.35, abs=1e-6
     )
     assert fitted.bias < fit_evidence(poses, PRIOR, 0.1).bias - 1.0
+    assert json.decode(json.encode(fitted), type=EvidenceWeights) == fitted
 
 
 def test_every_family_is_judged_by_a_fit_without_it():
@@ -189,6 +194,24 @@ def test_shared_errors_put_95_percent_inside():
     assert fitted.least == pytest.approx(0.02, rel=0.15)
     assert fit_shared_errors(poses(0.001, 0.02), before) == before  # never smaller
     assert fit_shared_errors([_pose(WRONG, evidence)], before) == before
+
+
+def test_wrong_poses_are_tried_as_well_and_not_stopped_before(
+    tiny_recording: Path, monkeypatch: pytest.MonkeyPatch
+):
+    stops, localize = list[NodeStop](), Localizer.localize
+
+    def noted(self: Localizer, *args: object, **named: object):
+        stops.append(self.context.first.weights.stop)
+        return localize(self, *args, **named)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(Localizer, "localize", noted)
+    recordings = {"demo/room": open_sequence(tiny_recording)}
+    poses = ask_place(
+        AskedPlace("demo/room", {"demo/room": 3}), recordings, Path(), "topoloc-net", 1
+    )
+    assert any(pose.is_right for pose in poses)
+    assert set(stops) == {NodeStop()} != {load_fitted_weights("topoloc-net").stop}
 
 
 def test_pairs_are_of_one_picture_and_too_few_of_them_change_nothing():

@@ -63,10 +63,11 @@ def fit_evidence(
     """
     poses = decided(poses)
     fitted = _logistic_regression(poses, prior, strength)
-    elsewhere = judged("", [pose for pose in poses if pose.error_m is None], fitted).log_odds
+    from_elsewhere = [pose for pose in poses if pose.error_m is None]
+    elsewhere = judged("", from_elsewhere, fitted).log_odds.tolist()
     most = math.log(_MOST_ELSEWHERE / (1.0 - _MOST_ELSEWHERE))
     fitted = replace(fitted, bias=fitted.bias - max(max(elsewhere, default=most) - most, 0.0))
-    of_wrong = judged("", [pose for pose in poses if pose.is_wrong], fitted).log_odds
+    of_wrong = judged("", [pose for pose in poses if pose.is_wrong], fitted).log_odds.tolist()
     return replace(
         fitted,
         clear_log_odds=round(

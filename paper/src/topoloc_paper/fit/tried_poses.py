@@ -18,6 +18,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.evidence import compute_translation_tolerance
+from topoloc.localization.fitted_weights import NodeStop
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.provenance import Evidence
@@ -95,7 +96,10 @@ def ask_place(
         sides = VirtualNodesConfig() if place.asks_walls else VirtualNodesConfig(spacing=0.0)
         config = BuildConfig(features=FeatureConfig(kind=kind), other_kinds=(), sides=sides)
         build_map(recordings[place.mapping], config).save(path)
-        localizer = Localizer(TopoMetricMap.load(path))
+        topomap = TopoMetricMap.load(path)
+        # A fit needs wrong poses, which the stop leaves untried.
+        weights = replace(Localizer(topomap).context.first.weights, stop=NodeStop())
+        localizer = Localizer(topomap, weights=weights)
         world_from_truth = (
             read_rigid(data / place.map_from_truth) if place.map_from_truth else Rigid3.identity()
         )
