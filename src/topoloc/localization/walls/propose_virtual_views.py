@@ -74,7 +74,7 @@ class VirtualViewProposal(Proposal):
 def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     """Generate the proposals with the most agreeing matches."""
     clear_log_odds = 2.5  # virtual views are skipped if a pose of the nodes has higher log-odds
-    max_hypotheses = 6  # maximum number of pose proposals that are refined
+    max_hypotheses = 3  # maximum number of pose proposals that are refined
     config, best = search.config.walls, search.best
     is_explained_by_nodes = (
         best is not None
@@ -108,9 +108,11 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
 
 def _may_show_place(search: Search, index: VirtualViewIndex) -> bool:
     """Return whether the nearest parts of the walls alone agree with a candidate place. They take
-    half as long to extract, and a right place shows itself in them."""
+    half as long to extract, and a right place shows itself in them.
+
+    They nearly always agree where the retrieved nodes do, and are not asked there."""
     stop = search.weights.walls.stop
-    if stop.near_tangent <= 0.0:
+    if stop.near_tangent <= 0.0 or search.num_retrieved >= search.config.num_chance_inliers:
         return True
     near = VirtualViewSearch.of(search, index, stop.near_tangent)
     return any(Comparison.of(near, place).num_strong >= stop.min_strong for place in near.places)
