@@ -40,7 +40,7 @@ def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
 def find_places(search: Search) -> Iterator[list[Row]]:
     """Generate the nodes of each place that are pooled. There are none if chance explains the
     votes."""
-    max_places, min_share = 2, 0.3  # minimum votes of a place, as a share of the most
+    max_places, min_share = 4, 0.3  # minimum votes of a place, as a share of the most
     rows, apart, of_places, of_nodes = count_votes(search)
     least = max(min_share * of_places.max(initial=0.0), search.weights.stop.min_votes)
     for _ in range(max_places):

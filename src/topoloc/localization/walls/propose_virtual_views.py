@@ -74,7 +74,7 @@ class VirtualViewProposal(Proposal):
 def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     """Generate the proposals with the most agreeing matches."""
     clear_log_odds = 2.5  # virtual views are skipped if a pose of the nodes has higher log-odds
-    max_hypotheses = 3  # maximum number of pose proposals that are refined
+    max_hypotheses = 4  # maximum number of pose proposals that are refined
     config, best = search.config.walls, search.best
     is_explained_by_nodes = (
         best is not None
