@@ -251,8 +251,7 @@ def agreements(search: Search, frame: StereoFrame) -> Iterator[tuple[str, bool, 
     assert index is not None
     whole = VirtualViewSearch.of(search, index)
     compared = [Comparison.of(whole, place) for place in whole.places]
-    measured = [(one.num_strong, one.match_all()) for one in compared]
-    proposed = [(strong, found) for strong, found in measured if found is not None]
+    proposed = [(one, found) for one in compared if (found := one.match_all()) is not None]
     errors = [error_of(found.cam_from_world.inverse(), frame) for _, found in proposed]
     near_right = [
         pair for pair, (m, deg) in zip(proposed, errors, strict=True) if m < 0.5 and deg < 10.0
@@ -261,7 +260,8 @@ def agreements(search: Search, frame: StereoFrame) -> Iterator[tuple[str, bool, 
     parts = VirtualViewSearch.of(search, index, stop.near_tangent or float("inf"))
     strong = [Comparison.of(parts, place).num_strong for place in parts.places]
     yield "nearest parts, strong", is_right, max(strong, default=0)
-    yield "whole views, strong", is_right, max((strong for strong, _ in chosen), default=0)
+    strong = [one.num_strong for one, _ in chosen]
+    yield "whole views, strong", is_right, max(strong, default=0)
     yield "whole views, all", is_right, max((found.num_agreeing for _, found in chosen), default=0)
 
 

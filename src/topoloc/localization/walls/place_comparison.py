@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -54,33 +53,29 @@ class AgreedPose:
 class Comparison:
     """Hold both views beside their predicted content at a place.
 
-    `matchers` match the features of each view, strongest first.
+    Of the matches of the strongest features, `num_strong` agree on one upright pose. `matchers`
+    match further features of each view.
     """
 
     walls: VirtualViewSearch
     cam_from_place: Rigid3
     sides: Sides
     matchers: list[Matcher]
+    num_strong: int
 
     @staticmethod
     def of(walls: VirtualViewSearch, place: Rigid3) -> Comparison:
-        """Return both views beside the points predicted from a place."""
-        cam_from_place = place.inverse()
+        """Match the strongest features of both views with the points predicted from a place."""
+        cam_from_place, weights = place.inverse(), walls.search.weights.walls
         sides, config = walls.sides_around(cam_from_place), walls.search.config.walls.matching
         matchers = [
             Matcher(side.features.descriptors, m.descriptors, (m.points_world, m.radii), config)
             for side, m in sides
         ]
-        return Comparison(walls, cam_from_place, sides, matchers)
-
-    @cached_property
-    def num_strong(self) -> int:
-        """The number of matches of the strongest features that agree on one upright pose. Not
-        known once all features were matched."""
-        num_strong = self.walls.search.weights.walls.stop.num_strong
-        matches = [matcher.match_first(num_strong) for matcher in self.matchers]
-        agreeing = _find_agreement(self.sides, matches, self.cam_from_place)
-        return 0 if agreeing is None else agreeing[0]
+        matches = [matcher.match_first(weights.stop.num_strong) for matcher in matchers]
+        agreeing = _find_agreement(sides, matches, cam_from_place)
+        num_strong = 0 if agreeing is None else agreeing[0]
+        return Comparison(walls, cam_from_place, sides, matchers, num_strong)
 
     def match_all(self) -> AgreedPose | None:
         """Match all features and return the upright pose that most matches agree on. None if too
