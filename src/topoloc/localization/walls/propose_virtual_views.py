@@ -97,7 +97,11 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
         compared.sort(key=lambda one: -one.num_strong)
     tried = list[VirtualViewProposal]()
     for one in compared:
-        if len(tried) == max_hypotheses or one.num_strong < _min_strong(search, compared[0]):
+        if (
+            len(tried) == max_hypotheses
+            or (len(tried) >= 2 and _is_hopeless(search))
+            or one.num_strong < _min_strong(search, compared[0])
+        ):
             return
         with search.query.clock.stage("walls"):
             proposal = _look_closer(one, tried)
@@ -116,6 +120,13 @@ def _may_show_place(search: Search, index: VirtualViewIndex) -> bool:
         return True
     near = VirtualViewSearch.of(search, index, stop.near_tangent)
     return any(Comparison.of(near, place).num_strong >= stop.min_strong for place in near.places)
+
+
+def _is_hopeless(search: Search) -> bool:
+    """Return whether no pose from virtual views is nearly probable. After two such poses of the
+    best places no further one was right (corridors of seeds 1 to 3 and 5, in reverse)."""
+    found = (one for one in search.belief.hypotheses if not one.evidence.is_of_nodes)
+    return max((one.log_odds for one in found), default=-math.inf) < -2.0
 
 
 def _min_strong(search: Search, best: Comparison) -> int:
