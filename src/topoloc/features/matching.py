@@ -7,13 +7,22 @@ distance^2 = 2 - 2 product.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from topoloc.features.config import MatchingConfig
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_nearest, find_similar
+from topoloc.features.matching_kernels import (
+    GROUP,
+    ROWS,
+    TILE,
+    find_nearest,
+    find_similar,
+    largest_products,
+)
 from topoloc.features.parallel import parallel_for_rows
 
 _LOWE_RATIO = 0.8
@@ -63,6 +72,21 @@ def find_similar_pairs(
     found = find_similar(_padded(many, packed), packed, len(few), np.float32(min_similarity))
     found = found[np.argsort(found[:, 1], kind="stable")]
     return found[:, 1], found[:, 0]
+
+
+def largest_similarities(
+    few: Float32[np.ndarray, "f d"], groups: Sequence[Float32[np.ndarray, "n d"]]
+) -> Float32[np.ndarray, "groups f"]:
+    """Return the largest scalar product of a descriptor of each group with each of a few
+    descriptors, at least 0."""
+    packed, largest = _packed(few), np.zeros((len(groups), len(few)), np.float32)
+
+    def run(first_group: int, last_group: int) -> None:
+        for row in range(first_group, last_group):
+            largest_products(_padded(groups[row], packed), packed, largest[row])
+
+    parallel_for_rows(run, len(groups))
+    return largest
 
 
 class Matcher:

@@ -68,6 +68,19 @@ def find_similar(query, packed, num_columns, least):
 
 
 @kernel()
+def largest_products(rows, packed, out):
+    """Raise out[column] to the largest product of a row with it. `rows` and `packed` are `query`
+    and `packed` of `multiply`."""
+    products = np.empty((ROWS, TILE * packed.shape[0]), np.float32)
+    for i in range(0, rows.shape[0] - ROWS + 1, ROWS):
+        multiply(rows[i : i + ROWS], packed, products)
+        for row in range(ROWS):
+            for column in range(len(out)):
+                product = products[row, column]
+                out[column] = product if product > out[column] else out[column]
+
+
+@kernel()
 def _are_duplicates(points, radii, a, b):
     squared = np.float32(0.0)
     for axis in range(3):

@@ -44,7 +44,7 @@ from topoloc.localization.fitted_weights import WallStop, load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.open_map import OpenMap
-from topoloc.localization.query import Query, QueryImage
+from topoloc.localization.query import Deadline, Query, QueryImage, StageClock
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, verify
 from topoloc.localization.walls import (
@@ -303,8 +303,9 @@ def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_whole_views_are_extracted_only_if_their_nearest_parts_show_a_place(
-    monkeypatch: pytest.MonkeyPatch, seed: int
+@pytest.mark.parametrize("num_retrieved", [0, 10])
+def test_nearest_parts_show_a_place_before_whole_views_unless_nodes_agree(
+    monkeypatch: pytest.MonkeyPatch, seed: int, num_retrieved: int
 ):
     tangents, extract = list[float](), virtual_view_matching._extract_view_features
 
@@ -313,15 +314,15 @@ def test_whole_views_are_extracted_only_if_their_nearest_parts_show_a_place(
         return extract(*arguments)
 
     monkeypatch.setattr(virtual_view_matching, "_extract_view_features", record)
-    localizer = Localizer(corridor_of_two_kinds())
-    result = localizer.localize(seen_on_the_way_back(seed)[0][0], WIDE)
-    near = localizer.context.types[-1].weights.walls.stop.near_tangent
-    if seed == 0:
-        assert isinstance(result, Localization)
-        assert tangents == [near, near, math.inf, math.inf]
-    else:
-        assert isinstance(result, NotLocalized)
-        assert tangents == [near, near]
+    query_image = QueryImage(seen_on_the_way_back(seed)[0][0], WIDE)
+    opened = Localizer(corridor_of_two_kinds()).context
+    search = opened.searches(query_image, StageClock(), Deadline())[-1]
+    search.num_retrieved = num_retrieved
+    assert bool(list(propose_virtual_views(search))) == (seed == 0)
+    near = search.weights.walls.stop.near_tangent
+    nearest = [] if num_retrieved else [near, near]
+    whole = [math.inf, math.inf] if num_retrieved or seed == 0 else []
+    assert tangents == nearest + whole
 
 
 def test_places_with_far_fewer_matches_are_not_looked_at_beside_a_clear_pose(

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
-from topoloc.features.features import Features
+from topoloc.features.matching import largest_similarities
 from topoloc.localization.proposals.propose import create_matcher, match_and_fit
 from topoloc.localization.refine import NodeProposal
 from topoloc.localization.search import Search
@@ -65,6 +65,7 @@ def count_votes(
     features that each node shows itself."""
     max_nodes = 128  # of a larger map, the nodes that rank first
     max_lag = 0.02  # similarity: a node this near to the nearest one shows the feature, too
+    num_features = 64
     query = search.query
     ranked = search.map.coarse.rank(query.image, query.features, max_nodes)
     points = {one.row: search.map.descriptors(one.row) for one in ranked}
@@ -72,7 +73,8 @@ def count_votes(
     if not rows or not len(query.features):
         return [], np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     apart = _distances_between(search, rows)
-    similarities = _best_similarities(query.features, [points[row] for row in rows])
+    strongest = query.features.descriptors[:num_features]
+    similarities = largest_similarities(strongest, [points[row] for row in rows])
     nearest, largest = similarities.argmax(axis=0), similarities.max(axis=0)
     elsewhere = np.where(apart[:, nearest] > 2.0, similarities, -1.0).max(axis=0)
     # where no node is elsewhere, a feature leads over none
@@ -88,13 +90,3 @@ def _distances_between(search: Search, rows: list[Row]) -> Float[np.ndarray, "no
     angles = np.arccos(np.clip(axes @ axes.T, -1.0, 1.0))
     metres = np.linalg.norm(centres[:, None] - centres, axis=2)
     return metres / (3.0 * search.map.d_thresh) + angles / 0.5
-
-
-def _best_similarities(
-    features: Features, points: list[Float32[np.ndarray, "n d"]]
-) -> Float32[np.ndarray, "nodes features"]:
-    """Return the largest similarity of a point of each node to each of the strongest features."""
-    num_features = 64
-    firsts = np.cumsum([0, *(len(of_node) for of_node in points[:-1])])
-    found = np.concatenate(points) @ features.descriptors[:num_features].T
-    return np.maximum.reduceat(found, firsts, axis=0)
