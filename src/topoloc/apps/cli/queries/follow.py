@@ -107,9 +107,13 @@ class Command:
             drone = None
             if self.mavlink is not None:
                 drone = stack.enter_context(closing(DroneLocalizer(self.mavlink, print_warning)))
+            last_ns = 0
             for frame in frames:
                 if stop.is_set():
                     break
+                if images is not None and frame.t_ns < last_ns:  # a bag that is played again
+                    tracker.reset()
+                last_ns = frame.t_ns
                 if robot is None:
                     answer = frame.localize(tracker.cameras, tracker, of_size)
                 else:
