@@ -221,12 +221,7 @@ def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibratio
     seen = fit.inlier_observations(1.0)
     points_img, sigma_px = seen.points_img.astype(np.float64), search.config.pose.key_point_sigma_px
     found = estimate_image_calibration(
-        points_img,
-        seen.points_world,
-        seen.covariances,
-        fit.camera,
-        fit.cam_from_world,
-        sigma_px,
+        points_img, seen.points_world, seen.covariances, fit.camera, fit.cam_from_world, sigma_px
     )
     if found is None:
         return None

@@ -258,12 +258,13 @@ class TopoMetricMap:
     def set_look_alike_floors(
         path: str | Path, value: bool, on_wait: Callable[[], None] | None = None
     ) -> None:
-        """Change `MapConfig.look_alike_floors` of a map file, as one edit. Raises MapError: no node
-        has colours, or the map cannot be read or written."""
+        """Change `MapConfig.look_alike_floors` of a map file, as one edit. Raises MapError: all
+        images are grey, or the map cannot be read or written."""
         from topoloc.mapping.edit import edit_map
 
         with edit_map(path, on_wait) as edit:
-            if value and not any(node.has_colours() for node in edit.topomap.nodes):
+            lights = [session.light for session in edit.topomap.sessions]
+            if value and lights and all(one and one.red == one.blue == 1.0 for one in lights):
                 raise MapError(
                     f"map {path} has no colours to tell floors apart: all its images are grey;"
                     f" `topoloc update {path} SEQ` adds a recording in colour"

@@ -46,6 +46,7 @@ from topoloc.plugin import Deadline, EncodedImage, image_size
 POLL_INTERVAL_S = 5.0
 """Seconds between two checks of an object store: one listing each, and a reading if it changed."""
 T = TypeVar("T")
+Results = dict[str, Localization | NotLocalized]
 
 
 class ServedAtlases:
@@ -132,18 +133,15 @@ class QueryHandler:
         """Localize in one map. Raises RequestError; TopolocError: image, camera or map is bad."""
         return self._run_query(name, query_request, self._localize_image)
 
-    def localize_everywhere(
-        self, query_request: QueryRequest
-    ) -> tuple[dict[str, Localization | NotLocalized], Failures]:
+    def localize_everywhere(self, query_request: QueryRequest) -> tuple[Results, Failures]:
         """Localize in every map and every atlas of the service. Those that are left share the time
         that is left. Return the results, and the faults of maps that cannot be read; raise the
         first if none can."""
-        opened, failures = self.atlases.opened(), Failures()
+        opened, answers, failures = self.atlases.opened(), Results(), Failures()
         end = time.perf_counter() + self._limit_ms(query_request.max_ms) / 1e3
         tiles = {tile_id for _, localizer in opened for tile_id in localizer.tile_ids}
         places = [(name, None) for name in self.maps.names() if name not in tiles]
         places += [(atlas.name, localizer) for atlas, localizer in opened]
-        answers = dict[str, Localization | NotLocalized]()
         for number, (name, atlas) in enumerate(places):
             if query_request.stop.is_set():
                 break
@@ -266,9 +264,7 @@ def result_to_line(result: Localization | NotLocalized, query: str) -> str:
     return json.dumps(result.to_json(query))
 
 
-def combine_results(
-    answers: dict[str, Localization | NotLocalized], failures: Failures, query: str
-) -> dict[str, Any]:
+def combine_results(answers: Results, failures: Failures, query: str) -> dict[str, Any]:
     """Return the results of several maps, those with a pose first. If several have one, the client
     chooses, because maps may overlap."""
     found = {name: result for name, result in answers.items() if isinstance(result, Localization)}

@@ -106,11 +106,6 @@ class TopoNode(OneLine):
         size = self.camera.width, self.camera.height
         return read_stored_image(f"node {self.summary.node_id}", self.template_image, size)
 
-    def has_colours(self) -> bool:
-        """Return whether the stored image is not grey. Raises as `read_image`."""
-        image = self.read_image()
-        return image is not None and image.ndim == 3 and bool(np.ptp(image, axis=2).mean() > 1.0)
-
 
 @dataclass(frozen=True, eq=False)
 class PlaceImage:

@@ -11,14 +11,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from topoloc import (
-    AtlasConfig,
-    Localizer,
-    LocalizerConfig,
-    StereoSequence,
-    Tracker,
-    TrackerConfig,
-)
+from topoloc import AtlasConfig, Localizer, LocalizerConfig, StereoSequence, Tracker, TrackerConfig
 from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
     File,

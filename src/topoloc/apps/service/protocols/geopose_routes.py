@@ -37,14 +37,13 @@ from topoloc.apps.service.protocols.geopose_messages import (
     read_image_size,
     read_request,
 )
-from topoloc.apps.service.query_handler import Failures, fit_camera
+from topoloc.apps.service.query_handler import Failures, Results, fit_camera
 from topoloc.apps.service.query_request import camera_from_json, parse_camera_field, read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 from topoloc.plugin import EncodedImage
 
 router = APIRouter(tags=["geopose"])
-Results = dict[str, Localization | NotLocalized]
 _MAX_DISAGREEMENT_M = 10.0
 _ERRORS = {
     400: "invalid request, or an unknown version",
