@@ -14,6 +14,7 @@ import pytest
 from made_once import once_a_run
 from topoloc.apps.cli import main
 from topoloc.demo.recordings import SHIPPED
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization, NotLocalized
@@ -139,6 +140,20 @@ def test_the_floor_is_judged_by_places_and_not_by_images(lab: TopoMetricMap):
         usual.add(replace(other, appearance=0.1))
     assert evidence.is_sure
     assert not usual.is_sure
+
+
+def test_weak_colours_settle_the_floor_at_five_places(lab: TopoMetricMap):
+    (found,) = _ask(lab, [_unseen()[0].image])
+    assert isinstance(found, Localization)
+    states = list[bool]()
+    for log_odds in (0.9, 1.1):
+        evidence = FloorEvidence(has_look_alikes=True)
+        for number in range(5):
+            place = Rigid3(found.world_from_cam.rotation, np.array([1.0 * number, 0.0, 0.0]))
+            appearance = 1.0 / (1.0 + np.exp(-log_odds))
+            evidence.add(replace(found, world_from_cam=place, appearance=appearance))
+            states.append(evidence.is_sure)
+    assert states == [False] * 9 + [True]
 
 
 def test_the_setting_is_an_option_of_build_is_shown_and_changed_later(
