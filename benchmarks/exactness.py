@@ -89,7 +89,7 @@ def print_row(name: str, localizer: Localizer, recording: str, every: int) -> No
         start = time.process_time()
         found = localizer.localize(frame.image, frame.camera)
         milliseconds = 1e3 * (time.process_time() - start)
-        if isinstance(found, Localization):
+        if isinstance(found, Localization) and frame.world_from_cam is not None:
             error = (found.world_from_cam.inverse() @ frame.world_from_cam).log()
             square = float(error @ np.linalg.solve(found.camera_covariance, error))
             metres = float(np.linalg.norm(error[:3]))

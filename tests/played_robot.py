@@ -258,13 +258,15 @@ class PlayedRobot:
 
 
 @contextmanager
-def followed(topomap: Path, domain: int, *options: str) -> Iterator[subprocess.Popen[str]]:
+def followed(
+    topomap: Path, domain: int, *options: str, stdout: Any = subprocess.DEVNULL
+) -> Iterator[subprocess.Popen[str]]:
     """`topoloc follow MAP ros:/camera/image_raw --ros`, as a user types it, in its own process."""
     command = [sys.executable, "-m", "topoloc", "follow", str(topomap), f"ros:{IMAGE_TOPIC}"]
     environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
     with subprocess.Popen(
         [*command, *options],
-        stdout=subprocess.DEVNULL,
+        stdout=stdout,
         stderr=subprocess.PIPE,
         text=True,
         env=environment,

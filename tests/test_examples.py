@@ -169,7 +169,7 @@ def test_own_features(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert max(_centimetres(printed, "median error")) < 0.5
     assert TopoMetricMap.load(tmp_path / "lab_orb.topo").kinds == ["orb"]
     _refuses_in_a_new_process(
-        tmp_path / "lab_orb.topo", "FeatureTypeError: no features of kind 'orb'", "feature_type"
+        tmp_path / "lab_orb.topo", "lab_orb.topo: no features of kind 'orb'", "feature_type"
     )
     surf = feature_types.FEATURE_TYPES["surf"]
     with pytest.raises(topoloc.FeatureTypeError, match="'surf' are topoloc's"):

@@ -80,6 +80,8 @@ export interface ResultOfMaps {
   /** The only map with a pose, else null. */
   map: string | null;
   answers: { map: string; result: Result }[];
+  /** Maps that cannot be read. */
+  failed: { map: string; error: string }[];
 }
 
 /** The bytes of an image file: JPEG, PNG, WebP ... */

@@ -47,10 +47,7 @@ if TYPE_CHECKING:
         UnreadableImageError as UnreadableImageError,
         WeightsError as WeightsError,
     )
-    from topoloc.evaluation.certification import (
-        Certification as Certification,
-        certify as certify,
-    )
+    from topoloc.evaluation.certification import Certification as Certification, certify as certify
     from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery
     from topoloc.evaluation.query_localization import (
         Evaluation as Evaluation,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import pytest
 from made_once import once_a_run
 from topoloc.apps.cli import main
 from topoloc.demo.recordings import SHIPPED
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization, NotLocalized
@@ -139,11 +142,50 @@ def test_the_floor_is_judged_by_places_and_not_by_images(lab: TopoMetricMap):
     assert not usual.is_sure
 
 
-def test_the_setting_is_an_option_of_build_and_stays_in_the_map(tmp_path: Path):
-    plain, strict = tmp_path / "plain.topo", tmp_path / "strict.topo"
-    recording = f"{SHIPPED / 'map_lap1'}@0:4:2"
-    assert main(["build", recording, str(plain), "--features", "surf"]) == 0
+def test_weak_colours_settle_the_floor_at_five_places(lab: TopoMetricMap):
+    (found,) = _ask(lab, [_unseen()[0].image])
+    assert isinstance(found, Localization)
+    states = list[bool]()
+    for log_odds in (0.9, 1.1):
+        evidence = FloorEvidence(has_look_alikes=True)
+        for number in range(5):
+            place = Rigid3(found.world_from_cam.rotation, np.array([1.0 * number, 0.0, 0.0]))
+            appearance = 1.0 / (1.0 + np.exp(-log_odds))
+            evidence.add(replace(found, world_from_cam=place, appearance=appearance))
+            states.append(evidence.is_sure)
+    assert states == [False] * 9 + [True]
+
+
+def test_the_setting_is_an_option_of_build_is_shown_and_changed_later(
+    lab: TopoMetricMap, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    strict, plain = str(tmp_path / "strict.topo"), str(tmp_path / "plain.topo")
     options = ["--features", "surf", "--look-alike-floors"]
-    assert main(["build", recording, str(strict), *options]) == 0
-    stored = [TopoMetricMap.load(path).config.look_alike_floors for path in (plain, strict)]
-    assert stored == [False, True]
+    assert main(["build", f"{SHIPPED / 'map_lap1'}@0:4:2", strict, *options]) == 0
+    lab.save(plain)
+    shown = list[str]()
+    for path, change in ((strict, None), (plain, None), (plain, "yes"), (plain, "no")):
+        if change is not None:
+            assert main(["update", path, "--look-alike-floors", change]) == 0
+        capsys.readouterr()
+        assert main(["info", path]) == 0
+        (line,) = (one for one in capsys.readouterr().out.splitlines() if "look-alike" in one)
+        with TopoMetricMap.load(path) as topomap:
+            shown.append(line.split()[2])
+            assert topomap.config.look_alike_floors == (shown[-1] == "yes")
+    assert shown == ["yes", "no", "yes", "no"]
+    with TopoMetricMap.load(plain) as topomap:
+        assert topomap.edits[-1].name == "look-alike floors: no"
+    assert main(["undo", plain]) == 0
+    with TopoMetricMap.load(plain) as topomap:
+        assert topomap.config.look_alike_floors
+
+
+def test_a_map_of_grey_images_cannot_tell_floors_apart_and_stays_as_it_is(
+    room_map: Path, tmp_path: Path, complaint: Callable[..., str]
+):
+    path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
+    said = complaint("update", path, "--look-alike-floors", "yes")
+    assert f"map {path} has no colours" in said
+    assert f"`topoloc update {path} SEQ`" in said
+    assert path.read_bytes() == room_map.read_bytes()

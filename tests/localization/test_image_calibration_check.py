@@ -52,6 +52,18 @@ def test_a_camera_that_turned_while_its_rows_were_read_is_no_doubt(
         assert np.rad2deg(error.angle()) < 0.5
 
 
+def test_a_refusal_names_a_focal_length_that_is_far_off(localizer: Localizer, queries: Path):
+    details = list[str]()
+    for frame in open_sequence(queries):
+        assert frame.camera is not None
+        result = localizer.localize(frame.image, with_focal(frame.camera, 2.0))
+        if isinstance(result, NotLocalized) and result.reason == "not_in_map":
+            details.append(result.detail)
+    fault = "or the calibration is wrong: the image asks for a focal length shorter than 520 px"
+    assert fault in details
+    assert set(details) <= {"", fault}
+
+
 @pytest.mark.parametrize("scale", [0.93, 1.08])
 def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scale: float):
     num_named = 0

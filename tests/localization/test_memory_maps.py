@@ -64,7 +64,7 @@ def test_single_pictures_without_poses_need_more(tiny_recording: Path):
     frames = [
         replace(recording[index], world_from_cam=None, right=None, rig=None) for index in range(3)
     ]
-    with pytest.raises(RecordingError, match="stereo pairs or depth images are needed"):
+    with pytest.raises(RecordingError, match="SLAM needs stereo pairs or depth images"):
         topoloc.build_map(topoloc.MemorySequence(frames), SURF_ALONE)
 
 

@@ -114,7 +114,8 @@ def test_what_was_written_comes_again(result: Localization | NotLocalized):
     again = result_from_json(text)
     assert type(again) is type(result)
     assert again.provenance == result.provenance
-    assert rounded(again.to_json("a.png")) == rounded(json.loads(text))
+    assert rounded(again.to_json()) == rounded(json.loads(text))
+    assert again.to_json("b.png")["query"] == "b.png"
 
 
 def test_what_was_suspected_is_known_again():

@@ -13,7 +13,7 @@ import pytest
 from built_room import unseen_views
 from corner_patches import CORNER_PATCHES
 from tiny_world import CAMERA
-from topoloc.errors import FeatureTypeError
+from topoloc.errors import FeatureTypeError, MapError
 from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.fitted_weights import load_fitted_weights
@@ -91,3 +91,9 @@ def test_a_map_of_a_kind_that_is_not_there_is_refused_in_one_line(
         FeatureTypeError, match="no features of kind 'corner-patches'; there are surf, sift"
     ):
         Localizer(topomap)
+    with pytest.raises(MapError) as refused:
+        TopoMetricMap.load(path)
+    text = str(refused.value)
+    assert text.startswith(f"map {path}: no features of kind 'corner-patches'; there are surf")
+    assert "topoloc.plugin.register_feature_type adds others" in text
+    assert "damaged" not in text

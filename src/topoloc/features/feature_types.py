@@ -195,8 +195,8 @@ def find_feature_type(name: str) -> FeatureType:
     kind = FEATURE_TYPES.get(name) or _VIRTUAL_VIEW_TYPES.get(name)
     if kind is None:
         raise FeatureTypeError(
-            f"no features of kind {name!r}; there are {', '.join(FEATURE_TYPES)}; others after"
-            " topoloc.plugin.register_feature_type"
+            f"no features of kind {name!r}; there are {', '.join(FEATURE_TYPES)};"
+            " topoloc.plugin.register_feature_type adds others, in each process"
         )
     return kind
 

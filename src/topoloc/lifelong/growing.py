@@ -26,10 +26,7 @@ from topoloc.lifelong.session_content import create_session_content, update_coar
 from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map
 from topoloc.lifelong.update import add_session
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.map_building import (
-    carry_over_error_shares,
-    with_map_statistics,
-)
+from topoloc.localization.map_facts.map_building import carry_over_error_shares, with_map_statistics
 from topoloc.localization.result import Localization
 from topoloc.mapping import build
 from topoloc.mapping.edit import save_map

@@ -37,10 +37,7 @@ def find_poorly_recognised(topomap: TopoMetricMap, session_poses: SessionPoses) 
 
 
 def select_learnable(
-    poor: Set[int],
-    motion: Sequence[Rigid3 | None],
-    session_poses: SessionPoses,
-    d_thresh: float,
+    poor: Set[int], motion: Sequence[Rigid3 | None], session_poses: SessionPoses, d_thresh: float
 ) -> set[int]:
     """Return the frames `poor` and the queried ones beside each, if their poses are certain: the
     map's answers agree with them. Without an answer, the session's own `motion` must agree with the

@@ -77,8 +77,7 @@ def _move_sides(
     """Return the virtual nodes in another world, with the places of their retrieval model."""
     models = {
         name: replace(
-            model,
-            arrays={**model.arrays, "centres": new_from_old.apply(model.arrays["centres"])},
+            model, arrays={**model.arrays, "centres": new_from_old.apply(model.arrays["centres"])}
         )
         for name, model in sides.coarse_models.items()
     }

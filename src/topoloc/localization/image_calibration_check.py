@@ -108,6 +108,24 @@ def check_image_calibration(
     )
 
 
+def find_focal_doubt(search: Search, fit: PoseFit) -> str:
+    """Return a sentence if the points of a refused pose ask for another focal length, else "".
+
+    Too few agree to say which one. It is by one linear step, less than a millisecond."""
+    num_sigmas, least = 3.0, 0.15  # logarithm; right calibrations of 108 refusals: up to 0.056
+    is_calibrated = not isinstance(fit.input_camera, UncalibratedCamera)
+    found = _estimate_image_calibration(search, fit) if is_calibrated else None
+    if found is None:
+        return ""
+    stretch, sigma = math.log(found.scale), math.sqrt(found.covariance[0, 0])
+    if abs(stretch) < max(least, num_sigmas * sigma):
+        return ""
+    longer = "longer" if stretch > 0.0 else "shorter"
+    focal = fit.camera.fx * search.query.scale
+    asked = f"the image asks for a focal length {longer} than {focal:.0f} px"
+    return f"or the calibration is wrong: {asked}"
+
+
 def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | None:
     """Return the mismatch if the residuals show distortion that the calibration leaves out.
 
@@ -221,12 +239,7 @@ def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibratio
     seen = fit.inlier_observations(1.0)
     points_img, sigma_px = seen.points_img.astype(np.float64), search.config.pose.key_point_sigma_px
     found = estimate_image_calibration(
-        points_img,
-        seen.points_world,
-        seen.covariances,
-        fit.camera,
-        fit.cam_from_world,
-        sigma_px,
+        points_img, seen.points_world, seen.covariances, fit.camera, fit.cam_from_world, sigma_px
     )
     if found is None:
         return None

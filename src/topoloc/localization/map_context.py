@@ -185,11 +185,7 @@ class MapContext:
             found = result.provenance.camera  # estimated with the pose
             camera = None if found is None else found.rescaled(camera.width, camera.height)
         provenance = Provenance(
-            self.map_id,
-            self.topomap.version,
-            result.provenance.features,
-            t_ns=t_ns,
-            camera=camera,
+            self.map_id, self.topomap.version, result.provenance.features, t_ns=t_ns, camera=camera
         )
         georeference = self.topomap.georeference
         if isinstance(result, NotLocalized):

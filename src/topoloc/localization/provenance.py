@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from msgspec import Struct
@@ -94,6 +94,7 @@ class Provenance(OneLine):
         atlas_from_cam: camera pose in the atlas's world, None if unknown.
         joint_world: name of the world that the tile shares with joined tiles.
         joint_from_cam: camera pose in the joint world.
+        query: name of the image, if the result was read. It is not compared.
     """
 
     map_id: str = ""
@@ -105,9 +106,10 @@ class Provenance(OneLine):
     atlas_from_cam: Rigid3 | None = None
     joint_world: str | None = None
     joint_from_cam: Rigid3 | None = None
+    query: str = field(default="", compare=False)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the provenance as keys of a result's JSON."""
+        """Return the provenance as keys of a result's JSON, without the image's name."""
         camera = None if self.camera is None else self.camera.to_json()
         of_atlas: dict[str, Any] = {} if self.tile is None else {"tile": self.tile}
         if self.atlas_from_cam is not None:
@@ -148,6 +150,7 @@ class _ProvenanceJson(Struct, frozen=True, rename={"map_id": "map", "map_version
     atlas_from_cam: Rigid3 | None = None
     joint_world: str | None = None
     joint_from_cam: Rigid3 | None = None
+    query: str = ""
 
 
 EMPTY_PROVENANCE = Provenance()

@@ -42,8 +42,8 @@ class _Result:
 
     @classmethod
     def from_json(cls: type[S], line: str | bytes | Mapping[str, Any]) -> S:
-        """Parse the output of `to_json`, as text or as an object, without the query name and
-        `seen_camera`. Raises ResultError: it is not a result, or one of the other class."""
+        """Parse the output of `to_json`, a text or an object. The image's name is in `provenance`;
+        `seen_camera` is lost. Raises ResultError: no result, or one of the other class."""
         result = result_from_json(line)
         if not isinstance(result, cls):
             kind = type(result).__name__
@@ -148,8 +148,8 @@ class Localization(_Result):
         rotation = self.world_from_cam.rotation
         return rotation @ self.camera_covariance[:3, :3] @ rotation.T
 
-    def to_json(self, query: str) -> dict[str, Any]:
-        """Return one line of the result file, see docs/cli.md."""
+    def to_json(self, query: str | None = None) -> dict[str, Any]:
+        """Return one line of the result file with the image's name, see docs/cli.md."""
         optional = {
             "focal_length_px": self.focal_length_px,
             "noise_share": self.noise_share if self.noise_share != 1.0 else None,
@@ -159,7 +159,7 @@ class Localization(_Result):
             "geopose": self.geopose and self.geopose.to_json(),
         }
         return {
-            "query": query,
+            "query": self.provenance.query if query is None else query,
             "localized": True,
             "world_from_cam": self.world_from_cam.to_json(),
             "covariance": self.covariance.tolist(),
@@ -225,9 +225,10 @@ class NotLocalized(_Result):
         """Return False."""
         return False
 
-    def to_json(self, query: str) -> dict[str, Any]:
-        """Return one line of the result file, see docs/cli.md."""
+    def to_json(self, query: str | None = None) -> dict[str, Any]:
+        """Return one line of the result file with the image's name, see docs/cli.md."""
         alternatives = [one.to_json() for one in self.alternatives]
+        query = self.provenance.query if query is None else query
         refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail}
         return refusal | {"alternatives": alternatives} | _evidence_json(self)
 

@@ -25,7 +25,7 @@ from topoloc.localization.evidence import (
     highest_probability,
     is_only_imprecise,
 )
-from topoloc.localization.image_calibration_check import check_image_calibration
+from topoloc.localization.image_calibration_check import check_image_calibration, find_focal_doubt
 from topoloc.localization.pose_fit import PointMatches, PointObservations
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
@@ -265,7 +265,7 @@ def _explain_not_localized(search: Search, ranked: list[Hypothesis]) -> NotLocal
     if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
         detail = _describe_imprecision(best)
         return _build_not_localized(search, "too_few_inliers", best.fit, detail)
-    return _build_not_localized(search, "not_in_map", best.fit)
+    return _build_not_localized(search, "not_in_map", best.fit, find_focal_doubt(search, best.fit))
 
 
 def _describe_imprecision(best: Hypothesis) -> str:

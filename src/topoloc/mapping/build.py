@@ -139,10 +139,7 @@ def _resolve_node_config(
 
 
 def _draft_nodes(
-    frames: list[MappingFrame],
-    locator: PointLocator,
-    config: BuildConfig,
-    progress: Progress,
+    frames: list[MappingFrame], locator: PointLocator, config: BuildConfig, progress: Progress
 ) -> NodeDrafts:
     """Discretise the trajectory by Eq. 1. Images with too few points (dark, blurred, blank) become
     no nodes."""

@@ -20,12 +20,7 @@ from topoloc.mapping.landmarks import (
     observe_points,
     refine_points,
 )
-from topoloc.mapping.mapping_frames import (
-    MappingFrame,
-    MappingImage,
-    PointLocator,
-    encode_small,
-)
+from topoloc.mapping.mapping_frames import MappingFrame, MappingImage, PointLocator, encode_small
 from topoloc.mapping.storage.entries import NodeSummary, TopoNode
 from topoloc.mapping.virtual_nodes import create_virtual_nodes
 from topoloc.node_ids import NodeId, Row

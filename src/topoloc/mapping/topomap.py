@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, no_type_check
 
 import numpy as np
 
-from topoloc.errors import FeatureTypeError
+from topoloc.errors import FeatureTypeError, MapError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.certificate import Certificate
@@ -253,6 +253,25 @@ class TopoMetricMap:
         from topoloc.mapping.storage.map_reading import open_map
 
         return open_map(Path(path))
+
+    @staticmethod
+    def set_look_alike_floors(
+        path: str | Path, value: bool, on_wait: Callable[[], None] | None = None
+    ) -> None:
+        """Change `MapConfig.look_alike_floors` of a map file, as one edit. Raises MapError: all
+        images are grey, or the map cannot be read or written."""
+        from topoloc.mapping.edit import edit_map
+
+        with edit_map(path, on_wait) as edit:
+            lights = [session.light for session in edit.topomap.sessions]
+            if value and lights and all(one and one.red == one.blue == 1.0 for one in lights):
+                raise MapError(
+                    f"map {path} has no colours to tell floors apart: all its images are grey;"
+                    f" `topoloc update {path} SEQ` adds a recording in colour"
+                )
+            config = replace(edit.topomap.config, look_alike_floors=value)
+            name = f"look-alike floors: {'yes' if value else 'no'}"
+            edit.commit(replace(edit.topomap, config=config), name)
 
     def close(self) -> None:
         """Close the file if the map was loaded. Later reads raise MapError."""

@@ -74,12 +74,7 @@ def follow_points(
     scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
     limits = {"patch_half_px": patch_half_px, "max_shift_px": max_shift_px}
     aligned = align_with_reference(
-        reference,
-        current.astype(np.float32),
-        points_ref[rows],
-        found[rows],
-        scales[rows],
-        **limits,
+        reference, current.astype(np.float32), points_ref[rows], found[rows], scales[rows], **limits
     )
     kept = aligned.is_matched
     return rows[kept], AlignedPoints(*(column[kept] for column in vars(aligned).values()))

@@ -129,21 +129,21 @@ def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
         CalibrationError: the frame has no camera model.
         RecordingError: `with_depth` is True and the frame has neither a right image nor depth.
     """
+    if with_depth and frame.right is None and frame.depth is None:
+        raise RecordingError(
+            f"{frame.name}: single pictures only; SLAM needs stereo pairs or depth images, a map of"
+            " single pictures their poses (topoloc build --trajectory FILE, or of a COLMAP model)"
+        )
     if frame.camera is None:
         raise CalibrationError(
             f"{frame.name}: no calibration; put a camera.json into the recording's folder"
         )
     if frame.rig is not None and (frame.right is not None or not with_depth):
         return _prepare_stereo(frame.image, frame.right if with_depth else None, frame.rig)
-    if frame.depth is not None or not with_depth:
-        grey, depth = to_grey(frame.image), None
-        if with_depth and frame.depth is not None:
-            depth = register_depth(frame.depth, frame.camera)
-        return PreparedFrame(frame.image, grey, frame.camera, Rigid3.identity(), depth=depth)
-    raise RecordingError(
-        f"{frame.name}: stereo pairs or depth images are needed, this recording has single pictures"
-        " only"
-    )
+    grey, depth = to_grey(frame.image), None
+    if with_depth and frame.depth is not None:
+        depth = register_depth(frame.depth, frame.camera)
+    return PreparedFrame(frame.image, grey, frame.camera, Rigid3.identity(), depth=depth)
 
 
 def undistort_frame(frame: StereoFrame, max_side_px: int) -> PreparedFrame:

@@ -31,11 +31,7 @@ from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import with_poses
 from topoloc.slam.calibration_checks import find_image_faults
-from topoloc.slam.global_optimization import (
-    adjust_global_bundle,
-    close_loops,
-    join_submaps,
-)
+from topoloc.slam.global_optimization import adjust_global_bundle, close_loops, join_submaps
 from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks
 from topoloc.slam.loop_closure import Link, find_links

@@ -94,9 +94,7 @@ def group_submaps(keyframes: Sequence[KeyFrame], links: Sequence[Link]) -> dict[
 
 
 def _find_similar_places(
-    keyframes: Sequence[KeyFrame],
-    places: list[int],
-    groups: dict[int, int],
+    keyframes: Sequence[KeyFrame], places: list[int], groups: dict[int, int]
 ) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """Return the similar pairs (earlier, later) of each two sub-maps that are apart."""
     # Number of most similar places in each other sub-map that a place is compared with.

@@ -250,9 +250,10 @@ class FloorEvidence:
     def is_sure(self) -> bool:
         """Return whether the places are of this floor. In a map with look-alike floors fewer than
         three do not suffice."""
-        weights, is_enough = load_appearance_weights(), len(self._seen) >= 3
+        weights, num, is_enough = load_appearance_weights(), len(self._seen), len(self._seen) >= 3
         least = math.log(weights.floor_odds[self._has_look_alikes])
-        least += weights.places_log_odds[self._has_look_alikes] if is_enough else 0.0
+        if is_enough:  # the mean of more places varies less
+            least += weights.places_log_odds[self._has_look_alikes] * math.sqrt(3.0 / num)
         # a floor that resembles this one does so at many places, so more add no more than three
-        seen = sum(log_odds for _, log_odds in self._seen) * 3.0 / max(3.0, len(self._seen))
+        seen = sum(log_odds for _, log_odds in self._seen) * 3.0 / max(3.0, num)
         return seen >= least and (is_enough or not self._has_look_alikes)

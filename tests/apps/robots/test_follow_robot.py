@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -106,6 +109,26 @@ def test_a_camera_without_calibration_is_one_line(robot: PlayedRobot, room_map: 
         "error: /camera/camera_info: K is zero, the camera is not calibrated; calibrate it, or give"
         " --camera FILE"
     )
+
+
+def test_a_bag_that_begins_again_is_followed_on(robot: PlayedRobot, room_map: Path, tmp_path: Path):
+    path = tmp_path / "answers.jsonl"
+    with path.open("w") as out, followed(room_map, DOMAIN, stdout=out) as process:
+        assert robot.wait_for_listener(START_S)
+        robot.steps, end = _drive(1.0, 1.1), time.monotonic() + START_S
+        for start_s in (2_000, 1_000):
+            answers = list[dict[str, Any]]()
+            while not any(one["t_ns"] // 10**12 == start_s // 1000 for one in answers):
+                assert process.poll() is None, process.stderr and process.stderr.read()
+                assert time.monotonic() < end
+                start_s += 1
+                robot.start_ns = start_s * 10**9
+                robot._play_images()
+                time.sleep(0.1)
+                answers = [json.loads(line) for line in path.read_text().splitlines()]
+        assert [answers[0]["state"], answers[-1]["state"]] == ["localized"] * 2
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
 
 
 def test_without_odometry_tf_is_that_of_the_camera(robot: PlayedRobot, room_map: Path):

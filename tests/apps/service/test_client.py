@@ -45,16 +45,15 @@ def test_results_are_those_of_a_localizer(service: Running, maps: Path, view: Pa
         assert client.explain("room", view, calibration)["tried"]
 
 
-def test_all_maps_are_asked(service: Running, maps: Path, view: Path, camera: str):
-    (maps / "damaged.topo").rename(maps / "damaged")
-    try:
-        with Client(service.url) as client:
-            answer = client.localize_everywhere(view, Camera.from_json(json.loads(camera)))
-    finally:
-        (maps / "damaged").rename(maps / "damaged.topo")
+def test_all_maps_are_asked_and_a_damaged_one_is_named(service: Running, view: Path, camera: str):
+    with Client(service.url) as client:
+        answer = client.localize_everywhere(view, Camera.from_json(json.loads(camera)))
     assert {row["map"] for row in answer["answers"]} == {"earth", "room"}
     assert answer["localized"]
     assert answer["map"] is None, "both maps are of this place"
+    (failed,) = answer["failed"]
+    assert failed["map"] == "damaged"
+    assert "damaged.topo is damaged" in failed["error"]
 
 
 def test_the_same_in_an_event_loop(service: Running, view: Path, camera: str):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import httpx
 import jsonschema
 import numpy as np
 import pytest
+from running_service import running
 
 from schemas import GEOPOSE, check_geopose, strict_object
 
@@ -183,6 +185,19 @@ def test_other_versions_and_malformed_requests_are_a_400_with_a_reason(
     for answer in wrong:
         assert answer.status_code == 400, answer.text
         assert answer.json()["ERROR"]
+
+
+def test_a_map_that_cannot_be_opened_is_left_out(
+    maps: Path, view: Path, camera: str, tmp_path: Path
+):
+    shutil.copy(maps / "earth.topo", tmp_path / "earth.topo")
+    (tmp_path / "broken.topo").write_text("no map")
+    with running(tmp_path) as service, service.client() as client:
+        request = _version_2(view, camera)
+        assert _ask(client, request).status_code == 200
+        named = client.post(ROUTE, params={"map": "broken"}, json=request)
+        assert named.status_code == 503
+        assert "broken" in named.json()["ERROR"]
 
 
 def test_not_localized_is_a_404_with_its_reason(

@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 from answers_compared import without_times
+from running_service import running
 
 from topoloc.apps.cli import main
 from topoloc.localization.result import Localization, result_from_json
@@ -151,6 +152,22 @@ def test_a_damaged_map_is_a_503_for_those_who_ask_it_and_nothing_to_others(
     assert client.post(
         "/v1/maps/room/localize", files={"image": view.open("rb")}, data=data
     ).json()["localized"]
+
+
+def test_maps_that_cannot_be_opened_do_not_keep_others_from_an_answer(
+    maps: Path, view: Path, camera: str, tmp_path: Path
+):
+    (tmp_path / "broken.topo").write_text("no map")
+    with running(tmp_path) as service, service.client() as client:
+        query = {"content": view.read_bytes(), "params": {"camera": camera}}
+        query["headers"] = {"content-type": "image/png"}
+        alone = client.post("/v1/localize", **query)
+        assert alone.status_code == 503
+        assert "broken" in alone.json()["error"]
+        shutil.copy(maps / "earth.topo", tmp_path / "earth.topo")
+        found = client.post("/v1/localize", **query).json()
+        assert (found["localized"], found["map"]) == (True, "earth")
+        assert [one["map"] for one in found["failed"]] == ["broken"]
 
 
 def test_metrics_count_answers(client: httpx.Client, view: Path, camera: str):

@@ -15,14 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc import (
-    Camera,
-    RecordingError,
-    Rigid3,
-    StereoFrame,
-    TrajectoryError,
-    read_image,
-)
+from topoloc import Camera, RecordingError, Rigid3, StereoFrame, TrajectoryError, read_image
 from topoloc.plugin import (
     IndexedFrames,
     RecordingFormat,

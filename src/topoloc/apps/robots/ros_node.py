@@ -89,11 +89,7 @@ class RosNode:
         return write
 
     def create_reader(
-        self,
-        name: str,
-        kind: Any,
-        quality: Quality,
-        callback: Callable[[Any], None] | None = None,
+        self, name: str, kind: Any, quality: Quality, callback: Callable[[Any], None] | None = None
     ) -> TopicReader:
         """Return a reader. `callback` gets each message, in the thread of `start`."""
         from cyclonedds.sub import DataReader

@@ -15,14 +15,7 @@ from urllib.parse import quote
 import httpx
 import numpy as np
 
-from topoloc import (
-    Camera,
-    Localization,
-    NotLocalized,
-    Rigid3,
-    ServiceError,
-    result_from_json,
-)
+from topoloc import Camera, Localization, NotLocalized, Rigid3, ServiceError, result_from_json
 
 ImageInput = str | Path | bytes | np.ndarray
 CameraSpec = Camera | str | None

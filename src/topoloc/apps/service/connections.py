@@ -191,10 +191,7 @@ def protocols(config: ServiceConfig, max_connections: int, behind_proxy: bool) -
     """Return the protocols as options of uvicorn. One address has a quarter of the connections;
     a proxy has all."""
     share = max_connections if behind_proxy else max_connections // 4
-    shared = {
-        "connections_open": Connections(max_connections, share),
-        "upload_s": config.upload_s,
-    }
+    shared = {"connections_open": Connections(max_connections, share), "upload_s": config.upload_s}
     return {
         "http": type("HttpProtocol", (_HttpProtocol,), shared),
         "ws": type("WebSocketProtocol", (_WebSocketProtocol,), shared),

@@ -153,14 +153,14 @@ async def localize(request: Request, map: MapName, parameters: UrlParameters) ->
 )
 async def localize_everywhere(request: Request, parameters: UrlParameters) -> JSONResponse:
     """Localize an image in all maps. `map` names the map of the only pose; it is null if there are
-    no poses or several."""
+    no poses or several. `failed` names the maps that cannot be read."""
     service, query = get_service(request), await read_query_request(request, parameters)
-    results = await service.run_job(
+    results, failures = await service.run_job(
         request, partial(service.query_handler.localize_everywhere, query), query.stop
     )
     for map_name, result in results.items():
         service.count(request, map_name, result)
-    return JSONResponse(combine_results(results, query.picture.name))
+    return JSONResponse(combine_results(results, failures, query.picture.name))
 
 
 @router.post(

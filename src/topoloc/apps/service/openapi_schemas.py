@@ -189,6 +189,8 @@ def _result_of_maps() -> dict[str, Any]:
     text, rows = {"type": "string"}, {"$ref": _REFERENCE.format(model="MapResult")}
     only = {"type": ["string", "null"], "description": "the only map with a pose"}
     answers = {"type": "array", "items": rows}
-    whole = strict(query=text, localized={"type": "boolean"}, map=only, answers=answers)
+    failed = {"type": "array", "items": strict(map=text, error=text)}
+    named = {"query": text, "localized": {"type": "boolean"}, "map": only}
+    whole = strict(**named, answers=answers, failed=failed)
     row = strict(map=text, result={"$ref": _REFERENCE.format(model="Result")})
     return {"ResultOfMaps": whole, "MapResult": row}

@@ -11,7 +11,8 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -20,15 +21,19 @@ from topoloc import (
     Atlas,
     AtlasConfig,
     Camera,
+    FeatureTypeError,
     Image,
     Localization,
     Localizer,
     MapCache,
+    MapError,
     NotLocalized,
+    ObjectStoreError,
     QueryError,
     TopolocError,
     TopoMetricMap,
     UncalibratedCamera,
+    WeightsError,
     read_image,
 )
 from topoloc.apps.report.explanation import explain, explanation_to_json
@@ -41,6 +46,7 @@ from topoloc.plugin import Deadline, EncodedImage, image_size
 POLL_INTERVAL_S = 5.0
 """Seconds between two checks of an object store: one listing each, and a reading if it changed."""
 T = TypeVar("T")
+Results = dict[str, Localization | NotLocalized]
 
 
 class ServedAtlases:
@@ -93,6 +99,27 @@ def _warn(text: str) -> None:
     log("tile", logging.WARNING, detail=text)
 
 
+class Failures(dict[str, TopolocError]):
+    """The faults of maps that cannot be read, by name."""
+
+    @contextmanager
+    def leaving_out(self, name: str) -> Iterator[None]:
+        """Add a fault of this map instead of raising it, so that the others answer. A silent object
+        store is raised: it may answer the next time."""
+        try:
+            yield
+        except ObjectStoreError:
+            raise
+        except (MapError, FeatureTypeError, WeightsError) as error:
+            log("left out", logging.WARNING, map=name, detail=str(error))
+            self[name] = error
+
+    def check_any(self, results: Mapping[str, object]) -> None:
+        """Raise the first fault if there are no results."""
+        if self and not results:
+            raise next(iter(self.values()))
+
+
 @dataclass(frozen=True, eq=False)
 class QueryHandler:
     """Localize images in the maps of the service. Searches end after `max_ms` milliseconds."""
@@ -106,27 +133,28 @@ class QueryHandler:
         """Localize in one map. Raises RequestError; TopolocError: image, camera or map is bad."""
         return self._run_query(name, query_request, self._localize_image)
 
-    def localize_everywhere(
-        self, query_request: QueryRequest
-    ) -> dict[str, Localization | NotLocalized]:
+    def localize_everywhere(self, query_request: QueryRequest) -> tuple[Results, Failures]:
         """Localize in every map and every atlas of the service. Those that are left share the time
-        that is left."""
-        localizers = [localizer for _, localizer in self.atlases.opened()]
+        that is left. Return the results, and the faults of maps that cannot be read; raise the
+        first if none can."""
+        opened, answers, failures = self.atlases.opened(), Results(), Failures()
         end = time.perf_counter() + self._limit_ms(query_request.max_ms) / 1e3
-        tiles = {tile_id for localizer in localizers for tile_id in localizer.tile_ids}
-        names = [name for name in self.maps.names() if name not in tiles]
-        answers, num_left = dict[str, Localization | NotLocalized](), len(names) + len(localizers)
-        for one in [*names, *localizers]:
+        tiles = {tile_id for _, localizer in opened for tile_id in localizer.tile_ids}
+        places = [(name, None) for name in self.maps.names() if name not in tiles]
+        places += [(atlas.name, localizer) for atlas, localizer in opened]
+        for number, (name, atlas) in enumerate(places):
             if query_request.stop.is_set():
                 break
-            remaining_ms = max(1.0, 1e3 * (end - time.perf_counter()) / num_left)
-            limited, num_left = replace(query_request, max_ms=remaining_ms), num_left - 1
-            if isinstance(one, str):
-                answers[one] = self.localize(one, limited)
-            else:
-                result = self._localize_in_atlas(one, limited)
-                answers[result.provenance.tile or ""] = result
-        return answers
+            remaining_ms = max(1.0, 1e3 * (end - time.perf_counter()) / (len(places) - number))
+            limited = replace(query_request, max_ms=remaining_ms)
+            with failures.leaving_out(name):
+                if atlas is None:
+                    answers[name] = self.localize(name, limited)
+                else:
+                    result = self._localize_in_atlas(atlas, limited)
+                    answers[result.provenance.tile or ""] = result
+        failures.check_any(answers)
+        return answers, failures
 
     def _localize_in_atlas(
         self, localizer: Localizer, query_request: QueryRequest
@@ -236,11 +264,13 @@ def result_to_line(result: Localization | NotLocalized, query: str) -> str:
     return json.dumps(result.to_json(query))
 
 
-def combine_results(answers: dict[str, Localization | NotLocalized], query: str) -> dict[str, Any]:
+def combine_results(answers: Results, failures: Failures, query: str) -> dict[str, Any]:
     """Return the results of several maps, those with a pose first. If several have one, the client
     chooses, because maps may overlap."""
     found = {name: result for name, result in answers.items() if isinstance(result, Localization)}
     ranked = sorted(answers, key=lambda name: -found[name].probability if name in found else 1.0)
     (only,) = found if len(found) == 1 else (None,)
     rows = [{"map": name, "result": answers[name].to_json(query)} for name in ranked]
-    return {"query": query, "localized": bool(found), "map": only, "answers": rows}
+    failed = [{"map": name, "error": str(error)} for name, error in failures.items()]
+    whole = {"query": query, "localized": bool(found), "map": only}
+    return whole | {"answers": rows, "failed": failed}

@@ -38,7 +38,8 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
       times the standard deviation of the change of brightness, and `bias`. Log-odds of the pose
       above the first of `clear_log_odds`, times the second, are added: a room may be painted anew.
     - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. The
-      log-odds of three places of a stream must exceed theirs by `places_log_odds`.
+      log-odds of three places of a stream must exceed theirs by `places_log_odds`, and three times
+      the mean of n places by this times the root of 3/n.
     """
 
     corpus: str

@@ -22,11 +22,7 @@ from topoloc.features.matching import Matcher
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.pose_fit import PointMatches
 from topoloc.localization.walls.upright_pose_kernels import largest_agreement, poses_from_pairs
-from topoloc.localization.walls.virtual_view_matching import (
-    Sides,
-    VirtualViewSearch,
-    merge_matches,
-)
+from topoloc.localization.walls.virtual_view_matching import Sides, VirtualViewSearch, merge_matches
 
 _NUM_PAIRS = 1500
 _MAX_YAW = math.radians(35.0)

@@ -30,10 +30,7 @@ from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.place_comparison import Comparison
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
-from topoloc.localization.walls.virtual_view_matching import (
-    VirtualViewSearch,
-    count_virtual_views,
-)
+from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch, count_virtual_views
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

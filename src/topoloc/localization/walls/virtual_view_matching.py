@@ -254,10 +254,7 @@ class VirtualViewSearch:
 
 
 def _extract_view_features(
-    config: FeatureConfig,
-    view: VirtualView,
-    picture: UInt8[np.ndarray, "a b"],
-    max_tangent: float,
+    config: FeatureConfig, view: VirtualView, picture: UInt8[np.ndarray, "a b"], max_tangent: float
 ) -> Features:
     """Extract the features of a view. Those of a part of it have no dense descriptors."""
     if math.isinf(max_tangent):

@@ -153,6 +153,8 @@ class MapFile:
                 yield
         except OSError as error:  # the file may be undamaged
             raise MapError(f"cannot read map {self.path}: {describe_failure(error)}") from error
+        except FeatureTypeError as error:  # the type of an extension, not registered here
+            raise MapError(f"map {self.path}: {error}") from error
         except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a programming error
             raise
         except (
@@ -161,7 +163,6 @@ class MapFile:
             zlib.error,
             CorruptDataError,
             ConfigError,
-            FeatureTypeError,
             CalibrationError,
             GeoreferenceError,
         ) as error:

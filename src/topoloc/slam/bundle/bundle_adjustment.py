@@ -18,11 +18,7 @@ from jaxtyping import Float, Int
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.bundle.block_kernels import count_covisible_pairs, find_covisible_pairs
 from topoloc.slam.bundle.block_system import BlockPattern, solve_blocks
-from topoloc.slam.bundle.bundle_kernels import (
-    eliminate_points,
-    robust_cost,
-    squared_residuals,
-)
+from topoloc.slam.bundle.bundle_kernels import eliminate_points, robust_cost, squared_residuals
 from topoloc.slam.bundle.observation_chunks import ObservationChunk, ObservationChunks
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from topoloc.apps.cli import main
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.trajectory import Trajectory
 
 
@@ -49,3 +51,19 @@ def test_slam_poses_and_others_do_not_mix(
 
 def test_single_pictures_are_refused(queries: Path, tmp_path: Path, complaint: Callable[..., str]):
     assert "single pictures only" in complaint("slam", queries, tmp_path / "x.tum")
+
+
+def test_photos_alone_are_no_map_and_what_the_errors_ask_for_makes_one(
+    tiny_recording: Path, tmp_path: Path, complaint: Callable[..., str]
+):
+    photos, target = tmp_path / "photos", tmp_path / "x.topo"
+    shutil.copytree(tiny_recording / "image_0", photos)
+    shutil.copy(tiny_recording / "truth.tum", tmp_path)
+    needed = complaint("build", photos, target)
+    assert "single pictures only" in needed
+    assert "build --trajectory FILE" in needed
+    posed = ["build", photos, target, "--trajectory", tmp_path / "truth.tum", "--features", "surf"]
+    assert "no calibration; put a camera.json into" in complaint(*posed)
+    shutil.copy(tiny_recording / "camera.json", photos)
+    assert main([str(one) for one in posed]) == 0
+    assert len(TopoMetricMap.load(target).summaries) > 1

@@ -45,10 +45,7 @@ class Command:
     points: File = None
     """Two or more points of both worlds, instead of --pose: lines of `x,y,z,new x,new y` or `name
     of a mapping image,new x,new y`. Three with a new z need no floor."""
-    up: Annotated[
-        Literal["x", "-x", "y", "-y", "z", "-z"] | None,
-        option("x|-x|y|-y|z|-z", "found by the floor"),
-    ] = None
+    up: Annotated[_Axis | None, option("x|-x|y|-y|z|-z", "found by the floor")] = None
     """The axis of the map's world that points up exactly."""
     camera_height: Annotated[float | None, option("METRES", "found by the floor")] = None
     """Median height of the mapping cameras above the floor."""

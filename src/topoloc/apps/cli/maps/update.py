@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc import Atlas, AtlasConfig, LocalizerConfig, Trajectory, open_place
+from topoloc import Atlas, AtlasConfig, LocalizerConfig, TopoMetricMap, Trajectory, open_place
 from topoloc.apps.cli.mapping.recordings_table import report_outcomes
 from topoloc.apps.cli.maps.session_update import AtlasUpdate, SessionUpdateOptions, describe_update
 from topoloc.apps.cli.output import (
@@ -22,10 +22,12 @@ from topoloc.apps.cli.output import (
     check_outputs,
     option,
     print_line,
+    print_waiting,
     progress_bar,
     write_json,
 )
 from topoloc.apps.cli.settings_file import Settings, read_settings
+from topoloc.apps.cli.tile_option import run_for_each_tile
 from topoloc.apps.cluster.config import ClusterConfig
 
 
@@ -54,6 +56,9 @@ class Command:
     topics: Topics = None
     light: Annotated[str | None, option("NAME", "from the images")] = None
     """Name of the illumination, such as `evening`. Sessions of one name have one illumination."""
+    look_alike_floors: Annotated[Literal["yes", "no"] | None, option("yes|no", "as it is")] = None
+    """Without recordings: whether the building has floors like this one that are not mapped, as in
+    `topoloc build`."""
     joined: Annotated[str | None, option("FILE.tum")] = None
     """Write the poses of the (one) recording in the map's world to this TUM file."""
     tile: Annotated[str | None, option("ID", "from the images")] = None
@@ -67,6 +72,18 @@ class Command:
     """TOML file with all other settings, as printed by `topoloc config update`."""
 
     def run(self) -> int:
+        if self.look_alike_floors is not None and len(self.paths) == 1:
+            place, value = open_place(self.paths[0]), self.look_alike_floors == "yes"
+
+            def change(path: Path) -> dict[str, Any]:
+                TopoMetricMap.set_look_alike_floors(path, value, print_waiting)
+                return {"look_alike_floors": value}
+
+            return run_for_each_tile(
+                place, self.tile, lambda tile_id: place.edit(tile_id, change), self.json
+            )
+        if self.look_alike_floors is not None:
+            raise UsageError("--look-alike-floors takes one map or atlas, without recordings")
         if len(self.paths) < 2:
             raise UsageError("update takes a map or an atlas, and at least one recording")
         if self.joined and len(self.paths) > 2:

@@ -11,14 +11,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from topoloc import (
-    AtlasConfig,
-    Localizer,
-    LocalizerConfig,
-    StereoSequence,
-    Tracker,
-    TrackerConfig,
-)
+from topoloc import AtlasConfig, Localizer, LocalizerConfig, StereoSequence, Tracker, TrackerConfig
 from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
     File,
@@ -107,9 +100,13 @@ class Command:
             drone = None
             if self.mavlink is not None:
                 drone = stack.enter_context(closing(DroneLocalizer(self.mavlink, print_warning)))
+            last_ns = 0
             for frame in frames:
                 if stop.is_set():
                     break
+                if images is not None and frame.t_ns < last_ns:  # a bag that is played again
+                    tracker.reset()
+                last_ns = frame.t_ns
                 if robot is None:
                     answer = frame.localize(tracker.cameras, tracker, of_size)
                 else:

@@ -45,10 +45,7 @@ class QueryFrame:
     odom_from_cam: Rigid3 | None = None
 
     def localize(
-        self,
-        cameras: SharedCameras,
-        tracker: Tracker | None,
-        camera_of_size: CameraOfSize | None,
+        self, cameras: SharedCameras, tracker: Tracker | None, camera_of_size: CameraOfSize | None
     ) -> QueryAnswer:
         """Localize the image, with a tracker as the next of a stream. Raises QueryError: the size
         of the image is not that of its camera."""

@@ -14,13 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int64, UInt16
 
-from topoloc import (
-    CalibrationError,
-    Image,
-    UnreadableImageError,
-    read_depth,
-    read_image,
-)
+from topoloc import CalibrationError, Image, UnreadableImageError, read_depth, read_image
 from topoloc.apps.formats.bags.messages import frame_id, image_bytes
 from topoloc.plugin import MAX_PIXELS, EncodedImage, RosCalibration, image_size
 

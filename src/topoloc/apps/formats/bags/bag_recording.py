@@ -39,12 +39,7 @@ from topoloc.apps.formats.bags.bag_calibration import (
 from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image, image_file
 from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
 from topoloc.apps.formats.bags.messages import decode, frame_id, header_stamp_ns, num_header_bytes
-from topoloc.apps.formats.bags.topics import (
-    Roles,
-    is_registered,
-    parse_topics,
-    select_topics,
-)
+from topoloc.apps.formats.bags.topics import Roles, is_registered, parse_topics, select_topics
 from topoloc.plugin import (
     CameraCalibration,
     EncodedImage,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Iterator
 from hashlib import sha256
@@ -16,8 +15,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse, Response
 from pydantic import ValidationError
 
-from topoloc import MapError, TopoMetricMap
-from topoloc.apps.service.logs import log
+from topoloc import TopoMetricMap
 from topoloc.apps.service.openapi_schemas import OBJECT_RESPONSE, error_responses, request_body
 from topoloc.apps.service.protocols.discovery_messages import (
     SEARCH_EXAMPLE,
@@ -28,6 +26,7 @@ from topoloc.apps.service.protocols.discovery_messages import (
     parse_resource,
 )
 from topoloc.apps.service.protocols.geopose_messages import ROUTE
+from topoloc.apps.service.query_handler import Failures
 from topoloc.apps.service.query_request import read_body
 from topoloc.apps.service.request_errors import RequestError, invalid_request
 from topoloc.apps.service.state import Service, get_service
@@ -128,14 +127,11 @@ def _look(service: Service, now_s: int) -> Iterator[Announced]:
             name, serial = PurePath(atlas.store.where).name, atlas.manifest.serial
             yield Announced(name, serial, enclose(corners), ROUTE, now_s)
     for name in (one for one in service.maps.names() if one not in tiles):
-        try:
-            with service.maps.use_map(name) as opened:
-                topomap = opened.content.topomap
-                path = f"{ROUTE}?map={quote(name, safe='')}"
-                if corners := _corners(topomap):
-                    yield Announced(name, topomap.version, enclose(corners), path, now_s)
-        except MapError as error:  # the others are announced all the same
-            log("not announced", logging.WARNING, map=name, detail=str(error))
+        with Failures().leaving_out(name), service.maps.use_map(name) as opened:
+            topomap = opened.content.topomap
+            path = f"{ROUTE}?map={quote(name, safe='')}"
+            if corners := _corners(topomap):
+                yield Announced(name, topomap.version, enclose(corners), path, now_s)
 
 
 def _corners(topomap: TopoMetricMap) -> list[tuple[float, float]]:

@@ -37,14 +37,13 @@ from topoloc.apps.service.protocols.geopose_messages import (
     read_image_size,
     read_request,
 )
-from topoloc.apps.service.query_handler import fit_camera
+from topoloc.apps.service.query_handler import Failures, Results, fit_camera
 from topoloc.apps.service.query_request import camera_from_json, parse_camera_field, read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 from topoloc.plugin import EncodedImage
 
 router = APIRouter(tags=["geopose"])
-Results = dict[str, Localization | NotLocalized]
 _MAX_DISAGREEMENT_M = 10.0
 _ERRORS = {
     400: "invalid request, or an unknown version",
@@ -106,11 +105,11 @@ def _localize_and_reply(
     atlases = [] if only is not None else handler.atlases.opened()
     tiles = {tile_id for _, localizer in atlases for tile_id in localizer.tile_ids}
     maps = [name for name in service.maps.names() if name not in tiles] if only is None else [only]
-    results: Results = {}
+    results, failures = Results(), Failures()
     georeferences = dict[str, Georeference]()
     deadline = handler.deadline_of(stop)
     for name in maps:
-        with service.maps.use_map(name) as opened:
+        with failures.leaving_out(name), service.maps.use_map(name) as opened:
             topomap = opened.content.topomap
             if topomap.georeference is not None:
                 camera = fit_camera(_select_camera(reading, picture, size, topomap), size, image)
@@ -127,6 +126,7 @@ def _localize_and_reply(
             result = nearby.localize(image, camera, max_ms=deadline)
             results[result.provenance.tile or ""] = result
             georeferences |= known
+    failures.check_any(results)
     if not results:
         raise RequestError(409, "no map is georeferenced; use `topoloc georeference`")
     if (best := _select_agreeing_map(results)) is None:
