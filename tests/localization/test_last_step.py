@@ -26,6 +26,7 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
+from topoloc.mapping.mapping_frames import encode_small
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -150,6 +151,18 @@ def test_a_shifted_patch_is_found_to_a_tenth_of_a_pixel(shift: tuple[float, floa
     assert np.abs(pixels[:2] - predicted[:2] - shift).max() < 0.1
     assert correlations[:2].min() > 0.98
     assert correlations[2] == -1.0
+
+
+def test_a_stored_image_is_scaled_as_its_camera_is():
+    picture = np.zeros((720, 960), np.uint8)  # 720 pixels become 400, and 960 become 533.3
+    picture[350:370, 900:920] = 255
+    stored = []
+    encode_small(picture, 400, lambda small: stored.append(small) or b"")
+    height, width = stored[0].shape
+    scaled = Camera.pinhole(960, 720, 570.0, 570.0, 479.5, 359.5).rescaled(width, height)
+    middle = np.array(ndimage.center_of_mass(stored[0].astype(float)))[::-1]
+    expected = scaled.img_from_cam(np.array([[(909.5 - 479.5) / 570.0, 0.0, 1.0]]))[0]
+    assert middle == pytest.approx(expected, abs=0.05)
 
 
 def test_a_patch_without_texture_matches_nothing():
