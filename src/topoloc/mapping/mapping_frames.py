@@ -79,11 +79,7 @@ class MappingImage:
 
 def prepare_view(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
     """Prepare a frame for measurements. Monocular images have no depth in any case."""
-    return prepare_frame(frame, with_depth and not _is_monocular(frame))
-
-
-def _is_monocular(frame: StereoFrame) -> bool:
-    return frame.right is None and frame.depth is None
+    return prepare_frame(frame, with_depth and not (frame.right is frame.depth is None))
 
 
 def select_posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame]:
@@ -156,10 +152,10 @@ def extract_mapping_image(
 ) -> MappingImage:
     """Extract the features of all types from a frame that has been read."""
     jpeg, light = encode_place_image(view.picture), Illumination.of_image(view.picture)
-    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     features = {
         kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
     }
+    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     return MappingImage(view.camera, world_from_view, features, jpeg, light)
 
 
