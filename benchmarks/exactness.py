@@ -2,13 +2,16 @@
 `"best"` in the same map, beside exact truth.
 
     python benchmarks/exactness.py MAP_SEQ QUERY_SEQ [QUERY_SEQ ...] [--every N]
+        [--map-from-truth FILE]
     python benchmarks/exactness.py MAP_SEQ QUERY_SEQ ... --vary num_nodes=6,12,24 ...
 
-Recordings as by `topoloc simulate`, or any with truth in the same world. MAP_SEQ may be a map file.
-`error/sigma` is the median error over the root of the covariance's trace: 0.89 if the covariance is
-exact. `inside` is the share of poses within their 95 % ellipsoid. `wrong`: beyond 0.25 m or 2
-degrees. `--vary` prints a row for each value of a number of `exact/weights.json` (JSON, such as
-`max_errors_px=[8,3],[8,4]` or `crowding.weight=0.3,0.4`), while the others stay.
+Recordings as by `topoloc simulate`, or any with truth in the same world, else FILE says where that
+of the queries lies in that of the map. MAP_SEQ may be a map file. `error/sigma` is the median error
+over the root of the covariance's trace: 0.89 if the covariance is exact. `inside` counts poses
+within their 95 % ellipsoid, `TOO FEW` if that is significantly (5 %) below 95 %. `wrong`: beyond
+0.25 m or 2 degrees. Last, all recordings together. `--vary` prints a row for each value of a number
+of `exact/weights.json` (JSON, such as `max_errors_px=[8,3],[8,4]` or `crowding.weight=0.3,0.4`),
+while the others stay.
 """
 
 from __future__ import annotations
@@ -22,7 +25,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from scipy.stats import binom
 
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact import last_step
 from topoloc.localization.exact.patch_alignment import load_last_step_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -30,8 +35,11 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
+from topoloc_paper.fit.corpus import read_rigid
 
 CHI_SQUARE_6_AT_95 = 12.592
+Row = tuple[float, ...]
+"""Metres, degrees, squared error in sigmas, error over sigma, milliseconds."""
 
 
 def main() -> None:
@@ -41,6 +49,7 @@ def main() -> None:
     parser.add_argument("mapped")
     parser.add_argument("queries", nargs="+")
     parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--map-from-truth", type=Path)
     parser.add_argument("--vary", nargs="+", default=[], metavar="NAME=VALUES")
     arguments = parser.parse_args()
     is_file = arguments.mapped.endswith(".topo")
@@ -50,12 +59,17 @@ def main() -> None:
         else build_map(open_sequence(arguments.mapped))
     )
     fast, best = (Localizer(topomap, LocalizerConfig(exactness=name)) for name in ("fast", "best"))
+    found: dict[str, list[Row]] = {}
+    file = arguments.map_from_truth
+    map_from_truth = read_rigid(file) if file else Rigid3.identity()
     for recording in arguments.queries:
-        name = Path(recording).name
+        name, asked = Path(recording).name, (recording, arguments.every, map_from_truth)
         if not arguments.vary:
-            print_row(f"{name}, fast", fast, recording, arguments.every)
+            found.setdefault("fast", []).extend(print_row(f"{name}, fast", fast, *asked))
         for label in vary_weights(arguments.vary):
-            print_row(f"{name}, {label}", best, recording, arguments.every)
+            found.setdefault(label, []).extend(print_row(f"{name}, {label}", best, *asked))
+    for label, rows in found.items():
+        print(f"{'all, ' + label:40} {describe_inside(np.array([row[2] for row in rows]))}")
 
 
 def vary_weights(changes: list[str]) -> Iterator[str]:
@@ -81,33 +95,43 @@ def set_number(numbers: dict[str, Any], path: list[str], value: Any) -> None:
     numbers[path[-1]] = value
 
 
-def print_row(name: str, localizer: Localizer, recording: str, every: int) -> None:
+def describe_inside(squares: np.ndarray) -> str:
+    num_inside, num = int(np.count_nonzero(squares < CHI_SQUARE_6_AT_95)), len(squares)
+    is_low = num > 0 and binom.cdf(num_inside, num, 0.95) < 0.05
+    return f"inside {num_inside} of {num}" + (", TOO FEW" if is_low else "")
+
+
+def print_row(
+    name: str, localizer: Localizer, recording: str, every: int, map_from_truth: Rigid3
+) -> list[Row]:
     sequence = open_sequence(recording)
-    rows, asked = list[tuple[float, ...]](), range(0, len(sequence), every)
+    rows, asked = list[Row](), range(0, len(sequence), every)
     for index in asked:
         frame = sequence[index]
         start = time.process_time()
         found = localizer.localize(frame.image, frame.camera)
         milliseconds = 1e3 * (time.process_time() - start)
         if isinstance(found, Localization) and frame.world_from_cam is not None:
-            error = (found.world_from_cam.inverse() @ frame.world_from_cam).log()
+            truth = map_from_truth @ frame.world_from_cam
+            error = (found.world_from_cam.inverse() @ truth).log()
             square = float(error @ np.linalg.solve(found.camera_covariance, error))
             metres = float(np.linalg.norm(error[:3]))
             degrees = float(np.rad2deg(np.linalg.norm(error[3:])))
             rows.append((metres, degrees, square, metres / found.position_sigma_m, milliseconds))
     if not rows:
         print(f"{name:40} 0 of {len(asked)}")
-        return
+        return rows
     metres, degrees, squares, ratios, milliseconds = np.array(rows).T
     num_wrong = np.count_nonzero((metres > 0.25) | (degrees > 2.0))
     print(
         f"{name:40} {len(rows)} of {len(asked)}, {num_wrong} wrong, median"
         f" {100 * np.median(metres):.3f} cm {np.median(degrees):.3f} deg,"
         f" 90 % {100 * np.percentile(metres, 90):.2f} cm, max {100 * metres.max():.1f} cm,"
-        f" inside {np.mean(squares < CHI_SQUARE_6_AT_95):.0%}, error/sigma {np.median(ratios):.2f},"
+        f" {describe_inside(squares)}, error/sigma {np.median(ratios):.2f},"
         f" {np.median(milliseconds):.0f} ms of the processor",
         flush=True,
     )
+    return rows
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from topoloc.geometry.rig import (
     depth_sigmas,
     depth_sigmas_of_disparity,
     points_from_depth,
-    points_from_disparity,
     ray_covariances,
 )
 from topoloc.geometry.rigid import Rigid3
@@ -33,9 +32,9 @@ def test_points_come_back_from_their_two_images(rig, x, y, z):
     assert left[0, 1] == pytest.approx(right[0, 1])
     disparity_px = left[:, 0] - right[:, 0]
     np.testing.assert_allclose(depth_from_disparity(disparity_px, rig), [z], rtol=1e-6)
-    np.testing.assert_allclose(
-        points_from_disparity(left, disparity_px, rig), point_cam, rtol=1e-6, atol=1e-6
-    )
+    depth = depth_from_disparity(disparity_px, rig)
+    points_cam = points_from_depth(left, depth, rig.left)
+    np.testing.assert_allclose(points_cam, point_cam, rtol=1e-6, atol=1e-6)
 
 
 def test_no_depth_without_disparity():
@@ -51,9 +50,8 @@ def test_stereo_covariance_agrees_with_samples():
     point_cam = np.array([[1.0, -0.7, 4.0]])
     pixel, disparity_px = RIG.left.img_from_cam(point_cam), LEFT.fx * RIG.baseline / point_cam[:, 2]
     n = 100_000
-    samples = points_from_disparity(
-        pixel + 0.8 * rng.normal(size=(n, 2)), disparity_px + 0.3 * rng.normal(size=n), RIG
-    )
+    depth = depth_from_disparity(disparity_px + 0.3 * rng.normal(size=n), RIG)
+    samples = points_from_depth(pixel + 0.8 * rng.normal(size=(n, 2)), depth, RIG.left)
     sigma_z = depth_sigmas_of_disparity(point_cam[:, 2], np.array([0.3]), RIG)
     expected = ray_covariances(point_cam, sigma_z, RIG.left, np.array([0.8]))[0]
     np.testing.assert_allclose(np.cov(samples.T), expected, rtol=0.05, atol=0.03 * expected.max())

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -18,7 +19,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization import schedule
-from topoloc.localization.exact import patch_alignment
+from topoloc.localization.exact import last_step, patch_alignment
 from topoloc.localization.exact.last_step import Surroundings, make_precise
 from topoloc.localization.exact.patch_alignment import load_last_step_weights
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
@@ -26,6 +27,7 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
+from topoloc.mapping.mapping_frames import encode_small
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -59,6 +61,21 @@ def test_poses_become_more_exact_and_stay_inside_their_ellipsoids(room: TopoMetr
         assert off @ np.linalg.solve(precise.camera_covariance, off) < 22.5  # 0.1 % of 6 dof
         assert precise.position_sigma_m < first.position_sigma_m
     assert np.mean(after) < 0.8 * np.mean(before)
+
+
+def test_a_pose_that_cannot_be_aligned_keeps_the_shared_errors_of_its_first_one(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
+    best, fast = Localizer(room), Localizer(room, LocalizerConfig(exactness="fast"))
+    image, _ = unseen_views(step=0.75)[0]
+    first, aligned = _localized(fast, image), _localized(best, image)
+    none = msgspec.structs.replace(load_last_step_weights(), min_aligned=10**6)
+    monkeypatch.setattr(last_step, "load_last_step_weights", lambda: none)
+    found = _localized(best, image)
+    assert _error_mm(found, first.world_from_cam) > 0.0
+    shared = (1.0 - first.noise_share) * first.covariance
+    assert np.linalg.eigvalsh(found.covariance - shared)[0] > -1e-12
+    assert aligned.position_sigma_m < found.position_sigma_m
 
 
 def test_the_second_look_needs_matches_in_most_parts_of_the_view(
@@ -150,6 +167,18 @@ def test_a_shifted_patch_is_found_to_a_tenth_of_a_pixel(shift: tuple[float, floa
     assert np.abs(pixels[:2] - predicted[:2] - shift).max() < 0.1
     assert correlations[:2].min() > 0.98
     assert correlations[2] == -1.0
+
+
+def test_a_stored_image_is_scaled_as_its_camera_is():
+    picture = np.zeros((720, 960), np.uint8)  # 720 pixels become 400, and 960 become 533.3
+    picture[350:370, 900:920] = 255
+    stored = []
+    encode_small(picture, 400, lambda small: stored.append(small) or b"")
+    height, width = stored[0].shape
+    scaled = Camera.pinhole(960, 720, 570.0, 570.0, 479.5, 359.5).rescaled(width, height)
+    middle = np.array(ndimage.center_of_mass(stored[0].astype(float)))[::-1]
+    expected = scaled.img_from_cam(np.array([[(909.5 - 479.5) / 570.0, 0.0, 1.0]]))[0]
+    assert middle == pytest.approx(expected, abs=0.05)
 
 
 def test_a_patch_without_texture_matches_nothing():

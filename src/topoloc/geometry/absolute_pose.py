@@ -31,8 +31,7 @@ from topoloc.geometry.pose_matches import (
 from topoloc.geometry.rigid import Rigid3
 
 MAX_THRESHOLD_SCALE = 3.0
-# OpenCV draws five points per sample and refines no candidate. It would need a second for the
-# iterations that PoseLib runs in milliseconds.
+# OpenCV would need a second for the iterations that PoseLib runs in milliseconds.
 _OPENCV_MAX_ITERATIONS = 1000
 _OPENCV_CONFIDENCE = 0.99  # its default
 
@@ -152,6 +151,7 @@ def refine_absolute_pose(
     max_error_px: float,
 ) -> AbsolutePose | None:
     """Refine cam_from_world on matches that each have a standard deviation of their own (pixels).
+    If residuals are smaller than these, so is the covariance.
 
     A match is an inlier if its reprojection error is at most `max_error_px`, even if its point is
     uncertain: `start` must be accurate to about that. None if too few matches are inliers.
@@ -166,14 +166,13 @@ def refine_absolute_pose(
         sigmas_px[rows],
         normalized[rows],
     )
-    cam_from_world = start
     for _ in range(2):  # the second pass uses the inliers of the first
-        active = _reprojection_errors(cam_from_world, matches, camera) <= max_error_px
+        active = _reprojection_errors(start, matches, camera) <= max_error_px
         if not is_non_collinear(matches.points_world[active]):
             return None
-        cam_from_world = refine_pose(cam_from_world, matches, active)
-    active = _reprojection_errors(cam_from_world, matches, camera) <= max_error_px
-    return _with_covariance(cam_from_world, matches, active, rows, len(points_img))
+        start = refine_pose(start, matches, active)
+    active = _reprojection_errors(start, matches, camera) <= max_error_px
+    return _with_covariance(start, matches, active, rows, len(points_img), 0.1)
 
 
 def estimate_pose_ransac(
@@ -186,8 +185,7 @@ def estimate_pose_ransac(
     """Run only PoseLib's RANSAC on n finite matches of undistorted pixels.
 
     Return cam_from_world, the number of inliers, and the sum of squared errors (px^2), each limited
-    to the squared threshold. Return None if the samples give no pose. The uncertainty of the points
-    is ignored.
+    to the squared threshold. Return None if the samples give no pose. Points count as exact.
 
     Args:
         is_sorted: the matches are sorted, most likely right first.
@@ -266,8 +264,9 @@ def _with_covariance(
     active: Bool[np.ndarray, " m"],
     order: np.ndarray,
     num_points: int,
+    min_noise_scale: float = 1.0,
 ) -> AbsolutePose | None:
-    covariance = estimate_pose_covariance(cam_from_world, matches, active)
+    covariance = estimate_pose_covariance(cam_from_world, matches, active, min_noise_scale)
     if covariance is None:
         return None
     inliers = np.zeros(num_points, dtype=np.bool_)

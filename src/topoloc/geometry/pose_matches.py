@@ -89,33 +89,38 @@ def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:
 
 
 def estimate_pose_covariance(
-    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"]
+    cam_from_world: Rigid3,
+    matches: Matches,
+    active: Bool[np.ndarray, " n"],
+    min_noise_scale: float = 1.0,
 ) -> Float[np.ndarray, "6 6"] | None:
     """Return the covariance of a pose that was fitted to the active matches: of the left
     perturbation (translation, rotation; m, rad). None if they do not fix the pose."""
     if np.count_nonzero(active) < MIN_POINTS or not is_non_collinear(matches.points_world[active]):
         return None
     arguments = matches.kernel_args(cam_from_world)
-    scale = estimate_noise_scale(squared_errors(*arguments)[active], 6)
+    scale = estimate_noise_scale(squared_errors(*arguments)[active], 6, min_noise_scale)
     information, *_ = normal_equations(*arguments, active, CAUCHY_SCALE * scale, 6)
     inverse = _invert_information(information)
     return None if inverse is None else _ESTIMATOR_VARIANCE * scale**2 * inverse
 
 
-def estimate_noise_scale(squares: Float[np.ndarray, " n"], num_unknowns: int) -> float:
+def estimate_noise_scale(
+    squares: Float[np.ndarray, " n"], num_unknowns: int, least: float = 1.0
+) -> float:
     """Return the factor by which the noise exceeds its assumed standard deviation, from squared
     whitened residuals of a fit of some unknowns (Huber's proposal 2, 1964).
 
-    It is at least 1. If few matches fit well, this is due to chance or to the fit itself.
+    It is at least `least`. If few matches fit well, this is due to chance or to the fit itself.
     """
     num_free, variance = max(2 * len(squares) - num_unknowns, 1), 1.0
     for _ in range(_MAX_SCALE_STEPS):
         scaled = squares / variance
         total = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2)))
-        ratio = total / (_MEAN_WEIGHTED_SQUARE * num_free)
-        if ratio <= 1.001:
+        better = max(least**2, variance * total / (_MEAN_WEIGHTED_SQUARE * num_free))
+        if abs(better / variance - 1.0) <= 0.001:
             break
-        variance *= ratio
+        variance = better
     return float(np.sqrt(variance))
 
 

@@ -23,14 +23,6 @@ def depth_from_disparity(
     return rig.left.fx * rig.baseline / np.where(effective > 0.0, effective, np.nan)
 
 
-def points_from_disparity(
-    points_img: Float[np.ndarray, "n 2"], disparity_px: Float[np.ndarray, " n"], rig: StereoRig
-) -> Float[np.ndarray, "n 3"]:
-    """Return points in the left camera's frame (metres) from pixels of the left image and their
-    disparity. Rows without a depth are NaN."""
-    return points_from_depth(points_img, depth_from_disparity(disparity_px, rig), rig.left)
-
-
 def points_from_depth(
     points_img: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"], camera: Camera
 ) -> Float[np.ndarray, "n 3"]:

@@ -22,7 +22,6 @@ from topoloc.localization.evidence import (
     create_unguided_matcher,
 )
 from topoloc.localization.guided import match_guided
-from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization
@@ -66,7 +65,7 @@ class NodeProposal(Proposal):
         ):
             return None
         with search.query.clock.stage("evidence"):
-            inflated = covariance_inflation(final.num_inliers, search.correlated_error_share)
+            inflated = 1.0 + final.num_inliers * search.correlated_error_share
             covariance = final.pose.inflated(inflated)
             unguided = None if self.is_guided else first
             evidence = compute_evidence(search, final, covariance, unguided, self.repeats)
@@ -170,7 +169,7 @@ def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:
     if not isinstance(final, PoseFit) or final.num_inliers < search.config.evidence.min_found:
         return None
     with search.query.clock.stage("evidence"):
-        inflated = covariance_inflation(final.num_inliers, search.correlated_error_share)
+        inflated = 1.0 + final.num_inliers * search.correlated_error_share
         return compute_best_case_evidence(search, final, final.pose.inflated(inflated))
 
 

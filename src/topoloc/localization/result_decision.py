@@ -26,6 +26,7 @@ from topoloc.localization.evidence import (
     is_only_imprecise,
 )
 from topoloc.localization.image_calibration_check import check_image_calibration, find_focal_doubt
+from topoloc.localization.map_facts.correlated_errors import shape_as_motion
 from topoloc.localization.pose_fit import PointMatches, PointObservations
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
@@ -42,8 +43,8 @@ ResultWithInliers = tuple[Localization | NotLocalized, list[LocalizationWithInli
 
 def decide_result(search: Search) -> ResultWithInliers:
     """Return the result that follows from the current belief."""
-    ranked = search.belief.ranked(search.weights.rivals)
-    min_probability = search.config.evidence.min_probability
+    rivals, min_probability = search.weights.rivals, search.config.evidence.min_probability
+    ranked = search.belief.ranked(rivals)
     if not ranked or ranked[0].probability < min_probability:
         return _explain_not_localized(search, ranked), []
     best = ranked[0]
@@ -51,7 +52,7 @@ def decide_result(search: Search) -> ResultWithInliers:
     others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in log_odds_margins)
     probability = best.evidence.precision_probability / (1.0 + others)
     is_leading = all(
-        by >= _min_log_odds_margin(search, best, other)
+        by >= (rivals.unclear_lead if _is_unclear_and_distant(search, best, other) else rivals.lead)
         for by, other in zip(log_odds_margins, ranked[1:], strict=True)
     )
     if is_leading and probability >= min_probability:
@@ -165,18 +166,12 @@ def _probability_within(search: Search, best: Hypothesis, camera: CameraBelief) 
 def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
     """Return the log-odds margin of the best hypothesis over another one.
 
-    If the best one is not clear and the other is elsewhere, the difference of log-odds also limits
-    it. If a wrong place of the map has nearly as much evidence, a place outside the map may as
-    well.
+    If the best one is not clear and the other is elsewhere, the difference of log-odds limits it:
+    if a wrong place of the map has nearly as much evidence, a place outside the map may as well.
     """
     by_all = log_odds_margin(best, other, search.weights.rivals)
     is_unclear = _is_unclear_and_distant(search, best, other)
     return min(by_all, best.log_odds - other.log_odds) if is_unclear else by_all
-
-
-def _min_log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
-    rivals = search.weights.rivals
-    return rivals.unclear_lead if _is_unclear_and_distant(search, best, other) else rivals.lead
 
 
 def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
@@ -212,11 +207,8 @@ def _build_localization(
 
 
 def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
-    """Inflate the covariance by errors that inliers share within parts of the image.
-
-    The errors common to the whole image and those common to parts add up. The factor is n rho +
-    coherence^2, relative to independent errors. Virtual views have an inflation of their own.
-    """
+    """Inflate the noise by errors that inliers share within parts of the image. Errors common to
+    all of it are those of nodes. Virtual views have an inflation of their own."""
     if search.weights.of(best.evidence).few_points:
         return best
     seen = best.fit.inlier_observations(1.0)
@@ -224,8 +216,13 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     coherence = compute_variance_inflation(
         *parts, best.fit.camera, best.fit.cam_from_world, search.config.pose.key_point_sigma_px
     )
-    wider = 1.0 + (coherence**2 - 1.0) * best.noise_share
-    return replace(best, covariance=wider * best.covariance, noise_share=best.noise_share / wider)
+    noise = best.noise_share * best.covariance
+    shared = best.covariance - noise
+    if np.allclose(noise, best.fit.pose.covariance, atol=0.0):  # no error of a camera was added
+        shared = shape_as_motion(shared, noise, best.fit.median_depth)
+    total = coherence**2 * noise + shared
+    share = np.trace(noise[:3, :3]) / np.trace(total[:3, :3])
+    return replace(best, covariance=total, noise_share=float(share))
 
 
 def _ambiguous_result(

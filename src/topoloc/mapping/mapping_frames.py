@@ -156,10 +156,10 @@ def extract_mapping_image(
 ) -> MappingImage:
     """Extract the features of all types from a frame that has been read."""
     jpeg, light = encode_place_image(view.picture), Illumination.of_image(view.picture)
-    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     features = {
         kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
     }
+    world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     return MappingImage(view.camera, world_from_view, features, jpeg, light)
 
 
@@ -181,7 +181,9 @@ def encode_small(picture: Image, side_px: int, encode: Callable[[Image], bytes])
     """Encode an image with its shorter side at most `side_px`."""
     scale = side_px / min(picture.shape[:2])
     if scale < 1.0:
-        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        # given factors, OpenCV rounds the size but not the factors, which shifts the right side
+        size = [round(scale * side) for side in picture.shape[1::-1]]
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     return encode(picture)
 
 

@@ -23,10 +23,10 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import (
     StereoRig,
+    depth_from_disparity,
     depth_sigmas,
     depth_sigmas_of_disparity,
     points_from_depth,
-    points_from_disparity,
     ray_covariances,
 )
 from topoloc.points.epipolar_kernels import match_in_ranges
@@ -117,11 +117,9 @@ def _points_from_stereo(
         np.full(num, max_disparity + 1), half_px, min_correlation, max_second_correlation,
         disparity, sigma,
     )  # fmt: skip
-    sigma = np.hypot(sigma.astype(np.float64), min_sigma_px)
-    points_cam = points_from_disparity(
-        features.points_img.astype(np.float64), disparity.astype(np.float64), rig
-    )
-    return points_cam, depth_sigmas_of_disparity(points_cam[:, 2], sigma, rig)
+    depth = depth_from_disparity(disparity.astype(np.float64), rig)
+    sigma_z = depth_sigmas_of_disparity(depth, np.hypot(sigma, min_sigma_px, dtype=float), rig)
+    return points_from_depth(features.points_img.astype(np.float64), depth, rig.left), sigma_z
 
 
 def measure_depths(

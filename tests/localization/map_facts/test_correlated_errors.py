@@ -19,7 +19,7 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts import correlated_errors
 from topoloc.localization.map_facts.correlated_errors import (
     ErrorShareMeasurement,
-    covariance_inflation,
+    shape_as_motion,
 )
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -133,9 +133,15 @@ def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Pa
     assert _rho(single) == WEIGHTS.unknown
 
 
-def test_without_correlated_errors_the_covariance_stays_as_it_is():
-    assert covariance_inflation(500, 0.0) == 1.0
-    assert covariance_inflation(100, 0.1) == pytest.approx(11.0)
+def test_shared_errors_are_motions_and_keep_their_mean_square_in_sigmas_of_the_noise():
+    root = np.random.default_rng(4).normal(size=(6, 6)) * [0.3, 0.2, 0.1, 0.02, 0.03, 0.01]
+    noise, depth = root.T @ root, 2.5
+    shared = shape_as_motion(50.0 * noise, noise, depth)
+    np.testing.assert_allclose(shared, np.diag(np.diag(shared)))
+    metres, radians = np.sqrt(np.diag(shared)).reshape(2, 3)
+    np.testing.assert_allclose(metres, depth * radians)
+    factor = 3.0  # of the worse nodes
+    assert np.trace(np.linalg.solve(noise, shared)) == pytest.approx(factor * 6.0 * 50.0)
 
 
 def test_the_first_query_computes_nothing_of_the_map(

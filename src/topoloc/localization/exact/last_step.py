@@ -45,6 +45,7 @@ class PreciseFit:
 
     pose: AbsolutePose
     matches: PreciseMatches
+    is_aligned: bool = False
 
 
 def _is_from_nodes(search: Search, evidence: Evidence | None) -> bool:
@@ -147,21 +148,18 @@ def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> Re
         if fit is None:
             return outcome
         seen = fit.matches.select(np.flatnonzero(fit.pose.inliers))
+        parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
+        cam_from_world = fit.pose.cam_from_world
         inflation = compute_variance_inflation(
-            seen.points_img.astype(np.float64),
-            seen.points_world,
-            seen.covariances,
-            first.query.camera,
-            fit.pose.cam_from_world,
-            seen.sigmas_px,
+            *parts, first.query.camera, cam_from_world, seen.sigmas_px
         )
-        noise = inflation**2 * fit.pose.covariance
-    cam_from_world = fit.pose.cam_from_world
+    noise = inflation**2 * fit.pose.covariance
     before = inverse_covariance(result.world_from_cam, result.covariance)
-    # the less the nodes contradict each other, the more of their errors average out
-    least, slope = weights.shared_error_line
-    remaining = min(1.0, least + slope * first.correlated_error_share)
-    shared = remaining * (1.0 - result.noise_share) * before
+    shared = (1.0 - result.noise_share) * before  # key points share the errors of the verdict's
+    if fit.is_aligned:
+        # the less the nodes contradict each other, the more of their errors average out
+        shared *= min(1.0, weights.shared_error_slope * first.correlated_error_share)
+        shared += np.dot(weights.slow_errors, (1.0, 1.0 / len(seen))) * noise
     precise = replace(
         result,
         world_from_cam=cam_from_world.inverse(),
@@ -196,7 +194,7 @@ def refine_precisely(
         if better is None or np.count_nonzero(better.pose.inliers) < weights.min_aligned:
             return fit
         aligned = better
-    return aligned
+    return replace(aligned, is_aligned=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,8 +220,7 @@ class Surroundings:
 
     def refine_by_key_points(self, cam_from_world: Rigid3) -> PreciseFit | None:
         """Refine the pose in two rounds: with the first search, then with all and tighter."""
-        num_searches = (1, len(self.searches))
-        fit: PreciseFit | None = None
+        fit, num_searches = None, (1, len(self.searches))
         for number, radius_px, max_error_px in zip(
             num_searches, self.weights.radii_px, self.weights.max_errors_px, strict=True
         ):
@@ -254,12 +251,13 @@ class Surroundings:
         totals = np.bincount(cells, minlength=num_cells)
         is_full = totals >= weights.min_cell_matches
         shares = np.bincount(cells, is_near, num_cells)[is_full] / totals[is_full]
-        is_whole = len(shares) >= weights.min_full_cells  # a lone door looks like another one
-        if not is_whole or np.quantile(shares, weights.quantile) < weights.min_share:
+        if (
+            len(shares) < weights.min_full_cells  # a lone door looks like another one
+            or np.quantile(shares, weights.quantile) < weights.min_share
+        ):
             return 0.0
-        expected = weights.chance_share * len(matches)
-        deviation = np.sqrt((1.0 - weights.chance_share) * expected)
-        crowding = (np.count_nonzero(is_near) - expected) / deviation
+        share, expected = weights.chance_share, weights.chance_share * len(matches)
+        crowding = (np.count_nonzero(is_near) - expected) / np.sqrt((1.0 - share) * expected)
         return float(weights.weight * crowding + weights.bias)
 
     def match(self, cam_from_world: Rigid3, radius_px: float, num_searches: int) -> PreciseMatches:

@@ -19,7 +19,7 @@ from msgspec import Struct
 from topoloc.errors import FeatureTypeError, MapError
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.pose_fit import PointObservations
@@ -64,7 +64,9 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
       table of the error of an aligned pixel. Matches below the first correlation are dropped.
       A pose of key points needs `min_matches`.
     - `max_correlated_error_share`: rho of a map above which the step is left out.
-    - `shared_error_line` (a, b): a + b rho of the verdict's correlated covariance remains.
+    - `shared_error_slope`: times rho, it is the share of the verdict's correlated covariance that
+      remains. `slow_errors` (a, b): errors that vary slowly over the image move the pose and leave
+      no residuals. Their variance is a + b / n times the noise of n aligned matches.
     """
 
     corpus: str
@@ -84,7 +86,8 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     correlations: tuple[Finite, ...]
     aligned_sigmas_px: tuple[Finite, ...]
     max_correlated_error_share: Finite
-    shared_error_line: tuple[Finite, Finite]
+    shared_error_slope: Finite
+    slow_errors: tuple[Finite, Finite]
     crowding: CrowdingWeights
 
 
@@ -143,7 +146,7 @@ class NodeTemplate:
         except MapError:
             image = None
         grey = np.zeros((2, 2), np.uint8) if image is None else to_grey(image)
-        camera = node.camera.rescaled(grey.shape[1], grey.shape[0])
+        camera = node.camera.rescaled(*grey.shape[::-1])
         colours = None if image is None else small_colours(image)
         return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None, colours)
 
@@ -180,7 +183,8 @@ def align(
     weights: LastStepWeights,
 ) -> PreciseMatches:
     """Align matches by correlation with the nodes' images. Matches that do not correlate are
-    dropped."""
+    dropped. Of the error of a point, that along the ray of its node remains: its pixel in the
+    node's image is where the patch was taken."""
     node_ids, node_of_match = np.unique(matches.node_ids, return_inverse=True)
     templates = [read_template(NodeId(int(node_id))) for node_id in node_ids]
     sizes = np.array([template.image.shape for template in templates]).reshape(-1, 2)
@@ -201,8 +205,13 @@ def align(
     parallel_for_rows(align_band, len(matches))
     rows = np.flatnonzero(correlations > weights.correlations[0])
     sigmas = np.interp(correlations[rows], weights.correlations, weights.aligned_sigmas_px)
-    aligned = pixels[rows].astype(np.float32)
-    return replace(matches.select(rows), points_img=aligned, sigmas_px=sigmas)
+    found, poses = matches.select(rows), [template.world_from_cam for template in templates]
+    rays = found.points_world - positions_of(poses)[node_of_match[rows]]
+    along = np.einsum("ni,nj,nk,nl,nkl->nij", rays, rays, rays, rays, found.covariances)
+    along /= np.square(np.sum(rays**2, axis=1))[:, None, None]
+    return replace(
+        found, points_img=pixels[rows].astype(np.float32), sigmas_px=sigmas, covariances=along
+    )
 
 
 def _compute_warps(

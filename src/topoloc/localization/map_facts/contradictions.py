@@ -20,7 +20,6 @@ from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.fitted_weights import load_fitted_weights
-from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.storage.entries import TopoNode
@@ -125,7 +124,7 @@ def _pose_difference(
     if found is None or np.count_nonzero(found.inliers) < min_inliers:
         return None
     poses = found.cam_from_world.inverse(), node.summary.world_from_cam
-    covariance = covariance_inflation(int(np.count_nonzero(found.inliers)), rho) * found.covariance
+    covariance = (1.0 + np.count_nonzero(found.inliers) * rho) * found.covariance
     is_same = poses[0].is_same(poses[1], covariance=covariance, max_square=max_square)
     return is_same, translation_error(*poses), rotation_error(*poses)
 

@@ -108,7 +108,7 @@ def carry_over_error_shares(topomap: TopoMetricMap, before: TopoMetricMap) -> To
     """Return a map with the correlated errors of the map that it was `before` nodes were added. A
     localizer finds repetitions when it needs them."""
     layers = {
-        kind: replace(layer, shared_errors=_error_share_of(topomap, kind).carry_over(known.rho))
+        kind: replace(layer, shared_errors=_error_share_of(topomap, kind).with_digest(known.rho))
         for kind, layer in topomap.layers.items()
         if (known := before.layers[kind].shared_errors) is not None
     }
@@ -117,7 +117,8 @@ def carry_over_error_shares(topomap: TopoMetricMap, before: TopoMetricMap) -> To
 
 def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
     """Measure rho of a map for a feature type."""
-    return _error_share_of(topomap, kind).measure_stored()
+    share = _error_share_of(topomap, kind)
+    return share.with_digest(share.measure())
 
 
 def _error_share_of(topomap: TopoMetricMap, kind: str) -> ErrorShareMeasurement:

@@ -25,7 +25,6 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import measure_evidence
-from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.place_comparison import Comparison
@@ -201,10 +200,7 @@ def _score(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis:
     guided = walls.guided(search.config.walls.rounds[-1][0])
     sides = walls.sides_around(final.cam_from_world)
     counts = count_virtual_views(sides, final.cam_from_world, guided)
-    inflated = (
-        covariance_inflation(num, search.correlated_error_share)
-        + search.weights.walls.few_points / num
-    )
+    inflated = 1.0 + num * search.correlated_error_share + search.weights.walls.few_points / num
     covariance = final.pose.inflated(inflated)
     columns_img = final.features.points_img[final.inlier_query_idx, 0]
     num_left = int(np.count_nonzero(columns_img < final.camera.cx))
