@@ -133,10 +133,8 @@ class ErrorShareMeasurement:
         """
         if not helpers:
             return None
-        min_inliers, cam_from_world = (
-            _SETTINGS["min_inliers"],
-            node.summary.world_from_cam.inverse(),
-        )
+        min_inliers = _SETTINGS["min_inliers"]
+        cam_from_world = node.summary.world_from_cam.inverse()
         local_map = LocalMap.concatenate([LocalMap.of_node(helper) for helper in helpers])
         matches = match_guided(node.features, local_map, cam_from_world, node.camera, self.guided)
         if len(matches) < min_inliers:
