@@ -66,10 +66,7 @@ def estimate_poses_by_motion(
     QueryError.
     """
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
-    numbered = [
-        {index: pose for index, pose in enumerate(poses) if pose is not None} for poses in stretches
-    ]
-    motions = [odom for odom in numbered if odom]
+    motions = [odom for poses in stretches if (odom := number_poses(poses))]
     if not motions:
         raise TrajectoryError(f"{sequence.name}: none of its frames has a pose; no map is changed")
     queried = list[list[int]]()
@@ -102,6 +99,11 @@ def estimate_poses_by_motion(
     poses = {index: pose for one in aligned for index, pose in one.world_from_cams.items()}
     inlier_idx = sorted(index for one in aligned for index in one.inlier_idx)
     return SessionPoses(poses, answers, inlier_idx)
+
+
+def number_poses(poses: Sequence[Rigid3 | None], first: int = 0) -> dict[int, Rigid3]:
+    """Return the known poses of successive frames by frame. `first` is that of the first one."""
+    return {first + index: pose for index, pose in enumerate(poses) if pose is not None}
 
 
 def align_motion_to_map(
