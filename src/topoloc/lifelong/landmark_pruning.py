@@ -15,15 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
+from topoloc.mapping.storage.entries import change_each
 from topoloc.mapping.storage.point_encoding import dequantize_descriptors, quantize_descriptors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
-from topoloc.node_ids import LazySequence
 
 # A node counts as quantized if the median norm of its stored descriptors is at most this many times
 # the norm expected for the step.
@@ -38,12 +37,7 @@ def transform_nodes(
     if all(transform(node) is node for layer in topomap.layers.values() for node in layer.nodes):
         return topomap
     layers = {
-        kind: replace(
-            layer,
-            nodes=LazySequence(
-                partial(len, layer.nodes), lambda row, layer=layer: transform(layer.nodes[row])
-            ),
-        )
+        kind: replace(layer, nodes=change_each(layer.nodes, transform))
         for kind, layer in topomap.layers.items()
     }
     return replace(topomap, layers=layers)
