@@ -204,7 +204,12 @@ class GrowingMap:
         if by_motion is not None:
             # Over the way up to its end motion may have drifted.
             lengths = compute_path_lengths(positions_of(by_motion.values()))
-            answers = _plausible(answers, by_motion, topomap.length_m + float(lengths[-1]))
+            # metres, at least a share of the way, and radians: other places look similar
+            reach = max(0.3, 0.05 * (topomap.length_m + lengths[-1])), np.deg2rad(15.0)
+            answers = {
+                k: one if one and one.world_from_cam.is_same(by_motion[k], *reach) else None
+                for k, one in answers.items()
+            }
         try:
             aligned = align_motion_to_map(posed.name, odom, answers, config.d_thresh)
         except TrajectoryError:
@@ -232,15 +237,3 @@ class GrowingMap:
         save_map(topomap, self.path, is_old_kept=False)
         self.close()
         self._topomap = TopoMetricMap.load(self.path)
-
-
-def _plausible(
-    answers: Mapping[int, Localization | None], by_motion: Mapping[int, Rigid3], way_m: float
-) -> dict[int, Localization | None]:
-    """Return the answers without those that are further from the poses by motion than its drift
-    allows: similar places elsewhere."""
-    reach = max(0.3, 0.05 * way_m), np.deg2rad(15.0)  # metres, at least a share of the way; radians
-    return {
-        k: one if one and one.world_from_cam.is_same(by_motion[k], *reach) else None
-        for k, one in answers.items()
-    }

@@ -59,6 +59,7 @@ def estimate_poses_by_map(
     max_sigma = 0.1
     found, odometry = _localize_stream(sequence, tracker, progress)
     d_thresh = map_config.d_thresh
+    limits = SLACK * d_thresh, math.radians(SLACK_DEG)
     localized = {index: answer for index, (_, answer) in found.items()}
     poses = {
         index: pose
@@ -76,11 +77,13 @@ def estimate_poses_by_map(
         for index in odom:
             is_inlier, pose = index in inlier_idx, poses.pop(index, None)
             answer = localized[index] if is_inlier else localized.pop(index, None)
-            if aligned is None:
-                pose = pose if is_inlier else None
+            if aligned is not None:
+                pose = aligned.get(index)
+                # A node that differs from the localization would contradict the map's nodes.
+                is_kept = answer is None or (pose and pose.is_same(answer.world_from_cam, *limits))
             else:
-                pose = _pose_if_consistent(aligned.get(index), answer, d_thresh)
-            if pose is not None:
+                is_kept = is_inlier
+            if pose is not None and is_kept:
                 poses[index] = pose
     known = sorted(poses.items(), key=lambda pair: pair[0])
     if not known:
@@ -233,17 +236,6 @@ def _reject_contradicted(
     left = {index: pose for index, pose in poses.items() if index not in contradicted}
     consistent = [index for index in inlier_idx if index not in apart]
     return (left, consistent) if len(consistent) >= MIN_AGREEING else (None, [])
-
-
-def _pose_if_consistent(
-    pose: Rigid3 | None, answer: Localization | None, d_thresh: float
-) -> Rigid3 | None:
-    """Return the pose, or None if the localization differs from it. A node there would contradict
-    the map's nodes."""
-    if pose is None or answer is None:
-        return pose
-    is_same = pose.is_same(answer.world_from_cam, SLACK * d_thresh, math.radians(SLACK_DEG))
-    return pose if is_same else None
 
 
 def _find_contradicted_frames(answered: list[int], apart: Set[int]) -> set[int]:

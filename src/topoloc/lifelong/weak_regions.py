@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
@@ -25,7 +25,6 @@ from topoloc.lifelong.node_localization import (
     sample_evenly,
 )
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.nodes import NodePoses
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row
 
@@ -192,10 +191,9 @@ def find_weak_regions(
     report = None if progress is None else partial(progress, "asking the map without the node")
     answers = localize_left_out(localizer, topomap, rows, beside, report)
     d_thresh = topomap.config.d_thresh
-    has_opposite_view = _has_opposite_view(topomap.node_poses, reach * d_thresh, min_turn_deg)
+    opposite = reach * d_thresh, np.cos(np.deg2rad(min_turn_deg))
     nodes = [
-        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), stood_by)
-        for row in topomap.rows
+        _assess_node(topomap, row, answers.get(row), opposite, stood_by) for row in topomap.rows
     ]
     parts = list[WeakRegion]()
     for reason in REASONS:
@@ -211,7 +209,7 @@ def _assess_node(
     topomap: TopoMetricMap,
     row: Row,
     answer: LeaveOneOutResult | None,
-    has_opposite_view: bool,
+    opposite: tuple[float, float],
     stood_by: float,
 ) -> NodeQuality:
     # The rest of the map must localize a node with at least this many inliers. An update adds
@@ -227,7 +225,7 @@ def _assess_node(
         reasons.append("not_held")
     if summary.num_points < min_landmarks:
         reasons.append("few_landmarks")
-    if not has_opposite_view:
+    if not topomap.node_poses.has_opposite(row, *opposite):
         reasons.append("one_direction")
     beside = (topomap.summaries[k].session_id for k in find_near_nodes(topomap, row, stood_by))
     if seen_share < min_seen_share and all(one == summary.session_id for one in beside):
@@ -251,18 +249,6 @@ def _seen_share(node: TopoNode) -> float:
         if one.session_id != node.summary.session_id:
             seen[one.rows[one.seen > 0]] = True
     return float(seen.mean()) if len(seen) else 0.0
-
-
-def _has_opposite_view(
-    poses: NodePoses, reach_m: float, min_turn_deg: float
-) -> Bool[np.ndarray, " nodes"]:
-    """Return for each node whether another one within reach looks in the opposite direction."""
-    axes, found = poses.rotations[:, :, 2], np.zeros(len(poses.centres), bool)
-    max_cos = np.cos(np.deg2rad(min_turn_deg))
-    for row, (centre, axis) in enumerate(zip(poses.centres, axes, strict=True)):
-        is_near = np.linalg.norm(poses.centres - centre, axis=1) <= reach_m
-        found[row] = (is_near & (axes @ axis <= max_cos)).any()
-    return found
 
 
 def _cluster_nodes(nodes: Sequence[NodeQuality], apart_m: float) -> list[list[NodeQuality]]:

@@ -21,7 +21,7 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.nodes import select_node_frames
+from topoloc.mapping.nodes import NodePoses, select_node_frames
 from topoloc.mapping.storage.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId, Row, as_rows
@@ -39,17 +39,10 @@ def select_virtual_view_nodes(world_from_nodes: list[Rigid3], config: MapConfig)
     spacing = config.sides.spacing
     if spacing == 0.0:
         return set()
-    reach = max_opposite * config.d_thresh
-    centres = np.array([pose.translation for pose in world_from_nodes])
-    axes = np.array([pose.rotation[:, 2] for pose in world_from_nodes])
-
-    def has_opposite_node(k: int) -> bool:
-        near = np.linalg.norm(centres - centres[k], axis=1) < reach
-        return bool((near & (axes @ axes[k] < -0.7)).any())
-
+    poses, reach = NodePoses.of(world_from_nodes), max_opposite * config.d_thresh
     d_thresh, lambda_rot = spacing * config.d_thresh, config.lambda_rot / 2.0
     rows = as_rows(select_node_frames(world_from_nodes, d_thresh, lambda_rot))
-    return {row for row in rows if not has_opposite_node(row)}
+    return {row for row in rows if not poses.has_opposite(row, reach, -0.7)}
 
 
 def find_new_virtual_views(topomap: TopoMetricMap, world_from_cams: Sequence[Rigid3]) -> set[int]:
