@@ -184,9 +184,8 @@ class PointLocator:
 
     def __init__(self, frames: Sequence[MappingFrame], config: MapConfig) -> None:
         self._config = config
-        self._sessions: dict[int, list[MappingFrame]] = {}
-        for frame in frames:
-            self._sessions.setdefault(frame.session_id, []).append(frame)
+        sessions = groupby(frames, lambda frame: frame.session_id)
+        self._sessions = {number: list(of_it) for number, of_it in sessions}
         self._steps = {
             number: compute_median_step([frame.world_from_cam for frame in of_it])
             for number, of_it in self._sessions.items()
