@@ -24,7 +24,12 @@ from topoloc.geometry.alignment import compute_path_lengths
 from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.json_data import OneLine
 from topoloc.lifelong.session_content import create_session_content, update_coarse_models
-from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map, number_poses
+from topoloc.lifelong.session_poses import (
+    SessionPoses,
+    align_motion_to_map,
+    number_poses,
+    select_queried_frames,
+)
 from topoloc.lifelong.update import add_session
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import (
@@ -35,7 +40,6 @@ from topoloc.localization.result import Localization
 from topoloc.mapping import build
 from topoloc.mapping.edit import save_map
 from topoloc.mapping.mapping_frames import create_session, select_posed_frames
-from topoloc.mapping.nodes import select_node_frames
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
 from topoloc.slam.slam import run_slam
@@ -193,11 +197,9 @@ class GrowingMap:
         place it."""
         odom, config = number_poses(posed.poses), topomap.config
         by_motion = self._chain(odom, first)
-        indices = list(odom)
-        rows = select_node_frames(list(odom.values()), config.d_thresh, config.lambda_rot)
         localizer = Localizer(topomap, self._localizer_config)
         answers = dict[int, Localization | None]()
-        for index in (indices[row] for row in rows):
+        for index in select_queried_frames(odom, config):
             frame, prior = posed[index], None if by_motion is None else by_motion[index]
             result = localizer.localize(frame.image, frame.camera, prior)
             answers[index] = result if isinstance(result, Localization) else None

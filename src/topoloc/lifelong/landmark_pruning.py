@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.mapping.storage.entries import change_each
@@ -118,16 +118,6 @@ def find_vanished(node: TopoNode) -> Bool[np.ndarray, " n"]:
     return vanished if vanished.sum() <= max_gone_share * num else np.zeros(num, bool)
 
 
-def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
-    """Return each landmark's probability of being seen if it should be visible, over all sessions
-    (Laplace's rule)."""
-    expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
-    for session_statistics in node.session_statistics:
-        expected[session_statistics.rows] += session_statistics.expected
-        seen[session_statistics.rows] += session_statistics.seen
-    return seen / expected
-
-
 def choose_landmarks(
     node: TopoNode, rows: Int[np.ndarray, " m"], most: int
 ) -> Int[np.ndarray, " k"]:
@@ -137,7 +127,12 @@ def choose_landmarks(
     size = node.camera.width / cells
     cell = (node.features.points_img[rows] / size).astype(np.int64)
     key = cell[:, 1] * (cells + 1) + cell[:, 0]
-    chances, gains = _observation_probability(node)[rows], np.empty(len(rows))
+    # the probability of being seen if it should be visible, over all sessions (Laplace's rule)
+    expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
+    for of_session in node.session_statistics:
+        expected[of_session.rows] += of_session.expected
+        seen[of_session.rows] += of_session.seen
+    chances, gains = (seen / expected)[rows], np.empty(len(rows))
     for one in np.unique(key):
         of_cell = np.flatnonzero(key == one)
         best_first = of_cell[np.argsort(-chances[of_cell], kind="stable")]

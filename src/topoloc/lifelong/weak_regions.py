@@ -25,7 +25,7 @@ from topoloc.lifelong.node_localization import (
     sample_evenly,
 )
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId, Row
 
 Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
@@ -220,7 +220,11 @@ def _assess_node(
     # a node beside it.
     min_seen_share = 0.2
     node, summary = topomap.nodes[row], topomap.summaries[row]
-    seen_share, reasons = _seen_share(node), list[Reason]()
+    seen, reasons = np.zeros(len(node.features), bool), list[Reason]()  # by other sessions
+    for one in node.session_statistics:
+        if one.session_id != summary.session_id:
+            seen[one.rows[one.seen > 0]] = True
+    seen_share = float(seen.mean()) if len(seen) else 0.0
     if answer is not None and answer.num_inliers < min_inliers:
         reasons.append("not_held")
     if summary.num_points < min_landmarks:
@@ -240,15 +244,6 @@ def _assess_node(
         answer,
         tuple(reasons),
     )
-
-
-def _seen_share(node: TopoNode) -> float:
-    """Return the share of a node's landmarks that other sessions saw."""
-    seen = np.zeros(len(node.features), bool)
-    for one in node.session_statistics:
-        if one.session_id != node.summary.session_id:
-            seen[one.rows[one.seen > 0]] = True
-    return float(seen.mean()) if len(seen) else 0.0
 
 
 def _cluster_nodes(nodes: Sequence[NodeQuality], apart_m: float) -> list[list[NodeQuality]]:
