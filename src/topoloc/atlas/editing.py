@@ -210,8 +210,7 @@ def store_tile(new: NewTile, put: PutFile) -> Tile:
         if len(topomap.summaries) == 0:
             raise EmptyMapError(f"map {new.path} has no nodes")
         vectors = compute_global_descriptors(topomap)
-        found = {kind: shared_vocabulary(kind) for kind in vectors}
-        versions = {kind: one.version for kind, one in found.items() if one is not None}
+        versions = {kind: one.version for kind in vectors if (one := shared_vocabulary(kind))}
         save_global_descriptors(path, vectors)
         places = structs.asdict(_store_file(put, f"{new.tile_id}.places", path))
         newest, *older = [new.path, *find_kept_files(new.path)]

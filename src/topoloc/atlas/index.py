@@ -35,14 +35,12 @@ def compute_global_descriptors(topomap: TopoMetricMap) -> dict[str, Float32[np.n
     """
     vectors = {}
     for kind, layer in topomap.layers.items():
-        vocabulary = shared_vocabulary(kind)
-        if vocabulary is None:
-            continue
-        rows = [
-            vocabulary.global_descriptor(node.features, node.camera.width, node.camera.height)
-            for node in layer.nodes
-        ]
-        vectors[kind] = np.stack(rows)
+        if (vocabulary := shared_vocabulary(kind)) is not None:
+            rows = [
+                vocabulary.global_descriptor(node.features, node.camera.width, node.camera.height)
+                for node in layer.nodes
+            ]
+            vectors[kind] = np.stack(rows)
     if not vectors:
         raise AtlasError(
             f"there is no shared vocabulary for features {', '.join(topomap.kinds)}, so that no"

@@ -119,8 +119,7 @@ class _IndexBuilder:
     def __post_init__(self) -> None:
         self._checksums = {tile.tile_id: tile.places.sha256 for tile in self.tiles}
         kinds = sorted({kind for tile in self.tiles for kind in tile.places.vocabularies})
-        found = {kind: shared_vocabulary(kind) for kind in kinds}
-        self.versions = {kind: one.version for kind, one in found.items() if one is not None}
+        self.versions = {kind: one.version for kind in kinds if (one := shared_vocabulary(kind))}
 
     @cached_property
     def stored(self) -> list[DescriptorShard]:

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from msgspec.structs import replace
 
 from topoloc.atlas.joins import Join, JointPose
+from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.geodesy import GeoPoint
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.slam.pose_graph import Edge, compute_normalized_residuals, optimize_pose_graph
@@ -51,11 +52,11 @@ def place_tiles(
         pose = tile.atlas_from_world or known.get(tile.world)
         if pose is None and joint is not None and joint.joint in known:
             pose = known[joint.joint] @ joint.joint_from_world
-        box = (
-            tile.geo_box
-            if pose is None or tile.geo_box is not None or origin is None
-            else _geo_box(origin, pose, tile.box_world)
-        )
+        box = tile.geo_box
+        if box is None and pose is not None and origin is not None:
+            corners = np.array(list(product(*tile.box_world.T)))
+            in_ecef = (origin.ecef_from_enu() @ pose).apply(corners)
+            box = geo_box([GeoPoint.from_ecef(corner) for corner in in_ecef])
         placed.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
     return tuple(placed), adjusted
 
@@ -72,15 +73,6 @@ def _place_by_georeference(tile: Tile, origin: GeoPoint | None) -> Tile:
     return replace(
         tile, atlas_from_world=atlas_from_ecef @ known.origin.ecef_from_enu() @ known.enu_from_world
     )
-
-
-def _geo_box(
-    origin: GeoPoint, atlas_from_world: Rigid3, box_world: Float[np.ndarray, "2 3"]
-) -> tuple[float, float, float, float]:
-    """Return the minimum and maximum latitude and longitude (degrees) of a box's corners."""
-    corners = np.array(list(product(*box_world.T)))
-    in_ecef = (origin.ecef_from_enu() @ atlas_from_world).apply(corners)
-    return geo_box([GeoPoint.from_ecef(corner) for corner in in_ecef])
 
 
 def geo_box(places: Sequence[GeoPoint]) -> tuple[float, float, float, float]:
@@ -152,14 +144,12 @@ def _is_inconsistent(
     groups: Mapping[str, Mapping[str, JointPose]], atlas_from_worlds: Mapping[str, Rigid3]
 ) -> bool:
     """Return whether joins place a world elsewhere than its georeference does."""
-    for anchor, group in groups.items():
-        for name in group.keys() & atlas_from_worlds.keys():
-            apart = (
-                atlas_from_worlds[anchor] @ group[name].joint_from_world
-            ).inverse() @ atlas_from_worlds[name]
-            if np.linalg.norm(apart.translation) > MAX_WORLD_OFFSET_M:
-                return True
-    return False
+    placed = (
+        (atlas_from_worlds[anchor] @ group[name].joint_from_world, atlas_from_worlds[name])
+        for anchor, group in groups.items()
+        for name in group.keys() & atlas_from_worlds.keys()
+    )
+    return any(translation_error(*pair) > MAX_WORLD_OFFSET_M for pair in placed)
 
 
 _WorldLink = tuple[int, str, Rigid3, Float[np.ndarray, "6 6"]]

@@ -15,7 +15,7 @@ import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
@@ -23,6 +23,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.place import open_place
+from topoloc.atlas.store import file_stamp
 from topoloc.atlas.tile_fetcher import TileFetcher, WatchedAtlas
 from topoloc.errors import MapError, MapNotFoundError
 from topoloc.mapping.node_cache import set_node_cache_size
@@ -193,7 +194,8 @@ class MapCache(Generic[M]):
             entry = self._entries.setdefault(name, _CacheEntry())
             self._entries.move_to_end(name)
         with entry.lock:
-            stamp = _file_stamp(path)
+            if (stamp := file_stamp(path)) is None:
+                raise MapError(f"map {path.name} is gone")
             if entry.opened is None or (entry.opened.path, entry.opened.stamp) != (path, stamp):
                 before, entry.opened = entry.opened, None
                 if before is not None:
@@ -260,15 +262,3 @@ class MapCache(Generic[M]):
             is_unused = opened.num_users == 0
         if is_unused:
             opened.content.topomap.close()
-
-
-def _file_stamp(path: Path) -> tuple[int, ...]:
-    """Return a stamp of a file that changes if the file is replaced.
-
-    Raises:
-        MapError: the file is missing.
-    """
-    with suppress(OSError):
-        status = path.stat()
-        return status.st_mtime_ns, status.st_size, status.st_ino
-    raise MapError(f"map {path.name} is gone")

@@ -108,10 +108,7 @@ class FolderStore:
 
     def version(self) -> Hashable | None:
         """See `Store.version`."""
-        with suppress(OSError):
-            status = (self.folder / MANIFEST).stat()
-            return status.st_mtime_ns, status.st_size, status.st_ino
-        return None
+        return file_stamp(self.folder / MANIFEST)
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
         """See `Store.commit`."""
@@ -185,6 +182,15 @@ class FolderStore:
             yield
         finally:
             close(descriptor)
+
+
+def file_stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return a stamp of a file that changes if the file is replaced, its bytes second. None if it
+    is missing."""
+    with suppress(OSError):
+        status = path.stat()
+        return status.st_mtime_ns, status.st_size, status.st_ino
+    return None
 
 
 def sha256_of(path: Path) -> str:

@@ -55,15 +55,9 @@ class Certification(OneLine):
         found = list[Rigid3]()
         for one in self.conditions:
             if one.kind == "walk" and one.has_truth:
-                seen = {
-                    piece
-                    for piece, answer in zip(one.pieces, one.answers, strict=True)
-                    if answer.result.localized
-                }
-                poses = {
-                    piece: answer.world_from_cam
-                    for piece, answer in zip(one.pieces, one.answers, strict=True)
-                }
+                pairs = list(zip(one.pieces, one.answers, strict=True))
+                seen = {piece for piece, answer in pairs if answer.result.localized}
+                poses = {piece: answer.world_from_cam for piece, answer in pairs}
                 found += [pose for piece, pose in poses.items() if piece not in seen and pose]
         return found
 
@@ -153,13 +147,8 @@ def _localize_walks(
                 f"{walk.name}: its poses are in another world than the map. `topoloc evaluate"
                 " --fit-map-from-truth FILE` writes the transform; certify with --map-from-truth"
             )
-        yield CertifiedAnswers(
-            walk.name,
-            "walk",
-            has_truth,
-            answers,
-            find_pieces(localizer.topomap.config, answers, has_truth),
-        )
+        pieces = find_pieces(localizer.topomap.config, answers, has_truth)
+        yield CertifiedAnswers(walk.name, "walk", has_truth, answers, pieces)
 
 
 def _localize_beside_map(

@@ -22,7 +22,7 @@ from topoloc.geometry.alignment import (
 )
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import find_least_median
-from topoloc.json_data import OneLine
+from topoloc.json_data import OneLine, encode_json
 from topoloc.localization.result import Localization
 
 _POSITION_SCALE_M, _ROTATION_SCALE = 0.25, np.deg2rad(2.0)
@@ -42,14 +42,7 @@ class WorldFit(OneLine):
 
     def to_json(self) -> dict[str, Any]:
         """Return the fit as JSON."""
-        return {
-            "recording": self.recording,
-            "map_from_truth": self.map_from_truth.matrix().tolist(),
-            "median_translation_m": self.median_translation_m,
-            "median_rotation_deg": self.median_rotation_deg,
-            "num_answers": self.num_answers,
-            "num_localized": self.num_localized,
-        }
+        return encode_json(self) | {"map_from_truth": self.map_from_truth.matrix().tolist()}
 
 
 def fit_worlds(answers: Sequence[EvaluatedQuery]) -> WorldFit | None:

@@ -13,7 +13,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import (
     MAX_THRESHOLD_SCALE,
@@ -234,6 +234,7 @@ def _refine_pose_and_focal(
     """Return the robust loss of all matches, and the pose and camera that fit the inliers best.
     Each round selects the inliers again."""
     cam_from_world, camera = start
+    middle = math.sqrt(uncalibrated.min_focal * uncalibrated.max_focal)
     loss, worst = math.inf, (config.max_reprojection_error_px / config.key_point_sigma_px) ** 2
     for _ in range(_MAX_ROUNDS):
         matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
@@ -243,9 +244,10 @@ def _refine_pose_and_focal(
         if not is_non_collinear(matches.points_world[inliers]):
             return None
         cam_from_world = refine_pose(cam_from_world, matches, inliers)
-        information, gradient = _normal_equations(
-            cam_from_world, matches, inliers, camera, uncalibrated
-        )
+        arguments = matches.kernel_args(cam_from_world)
+        information, gradient, *_ = normal_equations(*arguments, inliers, CAUCHY_SCALE, 7)
+        information[6, 6] += 1.0 / _LOG_FOCAL_SIGMA**2
+        gradient[6] += math.log(camera.fx / middle) / _LOG_FOCAL_SIGMA**2
         is_definite, step = solve_cholesky(information, -gradient)
         if not is_definite:
             return None
@@ -256,21 +258,3 @@ def _refine_pose_and_focal(
         camera = camera.with_focal(focal)
         cam_from_world = Rigid3.exp(step[:6]) @ cam_from_world
     return loss, cam_from_world, camera
-
-
-def _normal_equations(
-    cam_from_world: Rigid3,
-    matches: Matches,
-    active: Bool[np.ndarray, " n"],
-    camera: Camera,
-    uncalibrated: UncalibratedCamera,
-) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
-    """Return Gauss-Newton's information and gradient for the left perturbation of the pose and the
-    logarithm of the focal length. They include the prior on the focal length."""
-    information, gradient, *_ = normal_equations(
-        *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, 7
-    )
-    middle = math.sqrt(uncalibrated.min_focal * uncalibrated.max_focal)
-    information[6, 6] += 1.0 / _LOG_FOCAL_SIGMA**2
-    gradient[6] += math.log(camera.fx / middle) / _LOG_FOCAL_SIGMA**2
-    return information, gradient

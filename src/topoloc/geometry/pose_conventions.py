@@ -131,13 +131,13 @@ def find_conversion(convention: str) -> PoseConversion:
     """Return the function that undoes a convention, named as in `--poses`. Raises TrajectoryError
     if it is unknown."""
     name, _, value = convention.partition("=")
-    if name in ("scale", "body"):
-        numbers = _parse_numbers(convention, value, 1 if name == "scale" else 7)
-        if name == "scale":
-            if numbers[0] <= 0.0:
-                raise TrajectoryError(f"poses {convention!r}: the scale must be above 0")
-            return lambda pose: _scale_pose(pose, numbers[0])
-        body_from_cam = pose_from_quaternion(np.array(numbers))
+    if name == "scale":
+        (factor,) = _parse_numbers(convention, value, 1)
+        if factor <= 0.0:
+            raise TrajectoryError(f"poses {convention!r}: the scale must be above 0")
+        return lambda pose: _scale_pose(pose, factor)
+    if name == "body":
+        body_from_cam = pose_from_quaternion(np.array(_parse_numbers(convention, value, 7)))
         return lambda pose: pose @ body_from_cam
     if name in UNITS and not value:
         return lambda pose: _scale_pose(pose, UNITS[name])

@@ -60,10 +60,9 @@ class Matches:
 
     def kernel_args(self, cam_from_world: Rigid3) -> tuple[_Array, ...]:
         """Return the arguments that all kernels share."""
-        rotation, translation = cam_from_world.rotation, cam_from_world.translation
         return (
-            np.ascontiguousarray(rotation),
-            np.ascontiguousarray(translation),
+            np.ascontiguousarray(cam_from_world.rotation),
+            np.ascontiguousarray(cam_from_world.translation),
             self.normalized,
             self.covariances,
             self.points_world,
@@ -101,8 +100,14 @@ def estimate_pose_covariance(
     arguments = matches.kernel_args(cam_from_world)
     scale = estimate_noise_scale(squared_errors(*arguments)[active], 6, min_noise_scale)
     information, *_ = normal_equations(*arguments, active, CAUCHY_SCALE * scale, 6)
-    inverse = _invert_information(information)
-    return None if inverse is None else _ESTIMATOR_VARIANCE * scale**2 * inverse
+    diagonal = np.sqrt(np.diag(information))
+    if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
+        return None
+    scales = np.outer(diagonal, diagonal)  # makes metres and radians comparable
+    if np.linalg.eigvalsh(information / scales)[0] < 1e-12:
+        return None
+    inverse = np.linalg.inv(information / scales) / scales
+    return _ESTIMATOR_VARIANCE * scale**2 * ((inverse + inverse.T) / 2.0)
 
 
 def estimate_noise_scale(
@@ -122,16 +127,3 @@ def estimate_noise_scale(
             break
         variance = better
     return float(np.sqrt(variance))
-
-
-def _invert_information(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
-    """Return the inverse of an information matrix, or None if it does not fix all six degrees of
-    freedom."""
-    diagonal = np.sqrt(np.diag(information))
-    if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
-        return None
-    scales = np.outer(diagonal, diagonal)  # makes metres and radians comparable
-    if np.linalg.eigvalsh(information / scales)[0] < 1e-12:
-        return None
-    inverse = np.linalg.inv(information / scales) / scales
-    return (inverse + inverse.T) / 2.0

@@ -136,13 +136,9 @@ class _Estimate:
             return None
         rotation = self.rotation + step[6:]
         cam_from_world = Rigid3.exp(step[:6]) @ self.cam_from_world
-        log_odds = _log_odds(known, rotation)
+        # the odds against a camera at rest, by the estimate with the prior and the information of
+        # the image without it
+        posterior = known + np.eye(3) / _ROTATION_SIGMA**2
+        gain = 0.5 * float(rotation @ posterior @ rotation)
+        log_odds = gain - 0.5 * float(np.linalg.slogdet(posterior * _ROTATION_SIGMA**2)[1])
         return _Estimate(cam_from_world, rotation, log_odds, noise * inverse[6:, 6:], by_turn)
-
-
-def _log_odds(information: Float[np.ndarray, "3 3"], rotation: Float[np.ndarray, " 3"]) -> float:
-    """Return the log odds of a turning camera against one at rest, by the estimate with the prior
-    and the information of the image without it."""
-    posterior = information + np.eye(3) / _ROTATION_SIGMA**2
-    gain = 0.5 * float(rotation @ posterior @ rotation)
-    return gain - 0.5 * float(np.linalg.slogdet(posterior * _ROTATION_SIGMA**2)[1])

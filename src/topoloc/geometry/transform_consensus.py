@@ -107,7 +107,12 @@ def find_consensus(
         return None
     if image_ids is None:
         image_ids = np.column_stack([np.arange(num), np.arange(num)])
-    distances = _pairwise_distances(a_from_bs, covariances)
+    max_hypotheses, tried = 300, np.arange(num)
+    if num > max_hypotheses:  # this many are drawn, with a fixed seed
+        tried = np.sort(np.random.default_rng(0).choice(num, max_hypotheses, replace=False))
+    distances = np.stack(
+        [_distances(a_from_bs[k], covariances[k], a_from_bs, covariances) for k in tried.tolist()]
+    )
     best, agreeing = select_hypothesis(distances <= _MAX_SIGMAS, image_ids)
     if agreeing < min_independent:
         return None
@@ -124,26 +129,13 @@ def find_consensus(
     return TransformConsensus(a_from_b, covariance, is_inlier, num_independent)
 
 
-def _pairwise_distances(
-    a_from_bs: Sequence[Rigid3], covariances: Float[np.ndarray, "n 6 6"]
-) -> Float[np.ndarray, "h n"]:
-    """Return for each hypothesis (row) the distances of all estimates, in sigma of both."""
-    max_hypotheses = 300  # of more estimates this many are drawn, with a fixed seed
-    num = len(a_from_bs)
-    tried = np.arange(num)
-    if num > max_hypotheses:
-        tried = np.sort(np.random.default_rng(0).choice(num, max_hypotheses, replace=False))
-    return np.stack(
-        [_distances(a_from_bs[k], covariances[k], a_from_bs, covariances) for k in tried.tolist()]
-    )
-
-
 def _distances(
     hypothesis: Rigid3,
     covariance: Float[np.ndarray, "6 6"],
     a_from_bs: Sequence[Rigid3],
     covariances: Float[np.ndarray, "n 6 6"],
 ) -> Float[np.ndarray, " n"]:
+    """Return the distances of all estimates from a hypothesis, in sigma of both."""
     residuals = _residuals(hypothesis, a_from_bs)
     whitened = np.linalg.solve(covariances + covariance, residuals[..., None])[..., 0]
     return np.sqrt(np.einsum("ni,ni->n", residuals, whitened))

@@ -13,17 +13,23 @@ Existing nodes do not move, so the drift of a long loop stays at the place where
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from topoloc.errors import EmptyMapError, MapError, RecordingError, TrajectoryError
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.alignment import compute_path_lengths
+from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.json_data import OneLine
 from topoloc.lifelong.session_content import create_session_content, update_coarse_models
-from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map
+from topoloc.lifelong.session_poses import (
+    SessionPoses,
+    align_motion_to_map,
+    number_poses,
+    select_queried_frames,
+)
 from topoloc.lifelong.update import add_session
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import carry_over_error_shares, with_map_statistics
@@ -31,7 +37,6 @@ from topoloc.localization.result import Localization
 from topoloc.mapping import build
 from topoloc.mapping.edit import save_map
 from topoloc.mapping.mapping_frames import create_session, select_posed_frames
-from topoloc.mapping.nodes import select_node_frames
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
 from topoloc.slam.slam import run_slam
@@ -118,7 +123,9 @@ class GrowingMap:
         self.max_shift_m = max(self.max_shift_m, shift)
         num_apart = sum(one.stop - one.before for one in self._apart)
         seconds = time.monotonic() - began
-        return Growth(stop - before, num_posed, *self._size(), shift, seconds, num_apart)
+        known = self._topomap
+        size = (0, 0.0) if known is None else (len(known.summaries), known.length_m)
+        return Growth(stop - before, num_posed, *size, shift, seconds, num_apart)
 
     def _join(self, sequence: StereoSequence, piece: _Piece) -> tuple[int, float] | None:
         """Add a piece to the map. Return how many of its new frames have a pose, and its shift.
@@ -127,8 +134,9 @@ class GrowingMap:
         try:
             posed = run_slam(frames).apply([frames])[0]
             if self._topomap is None:
-                self._begin(posed)
-                poses, shift = _numbered(posed.poses, piece.first), 0.0
+                built = build.build_map(posed, self._config, None, ["slam"])
+                self._write(with_map_statistics(built))
+                poses, shift = number_poses(posed.poses, piece.first), 0.0
             else:
                 poses, shift = self._extend(self._topomap, posed, piece)
         except (RecordingError, TrajectoryError, EmptyMapError) as error:
@@ -148,15 +156,6 @@ class GrowingMap:
         """Close the map file."""
         if self._topomap is not None:
             self._topomap.close()
-
-    def _size(self) -> tuple[int, float]:
-        known = self._topomap
-        return (0, 0.0) if known is None else (len(known.summaries), known.length_m)
-
-    def _begin(self, posed: StereoSequence) -> None:
-        """Build the map of the first piece."""
-        built = build.build_map(posed, self._config, None, ["slam"])
-        self._write(with_map_statistics(built))
 
     def _extend(
         self, topomap: TopoMetricMap, posed: StereoSequence, piece: _Piece
@@ -180,7 +179,7 @@ class GrowingMap:
         posed = select_posed_frames(view, session.session_id)
         # The others show what these show, too. Describing an image takes as long as its odometry.
         frames = [one for one in posed if one.index in session_poses.answers or one.index % 3 == 0]
-        content = create_session_content(topomap, frames, session_poses, _no_progress)
+        content = create_session_content(topomap, frames, session_poses, lambda *_: None)
         piece = create_session(view, posed, "slam", session.camera, content.lights)
         changed = add_session(topomap, piece, posed, content)
         changed, _ = update_coarse_models(changed, content.views, content.images)
@@ -193,18 +192,23 @@ class GrowingMap:
         """Return the poses of a piece in the map, and how far (metres) the map moves its end from
         where motion alone sees it. Raises TrajectoryError: neither its first frames nor the map
         place it."""
-        odom, config = _numbered(posed.poses), topomap.config
+        odom, config = number_poses(posed.poses), topomap.config
         by_motion = self._chain(odom, first)
-        indices = list(odom)
-        rows = select_node_frames(list(odom.values()), config.d_thresh, config.lambda_rot)
         localizer = Localizer(topomap, self._localizer_config)
         answers = dict[int, Localization | None]()
-        for index in (indices[row] for row in rows):
+        for index in select_queried_frames(odom, config):
             frame, prior = posed[index], None if by_motion is None else by_motion[index]
             result = localizer.localize(frame.image, frame.camera, prior)
             answers[index] = result if isinstance(result, Localization) else None
         if by_motion is not None:
-            answers = _plausible(answers, by_motion, self._way(by_motion))
+            # Over the way up to its end motion may have drifted.
+            lengths = compute_path_lengths(positions_of(by_motion.values()))
+            # metres, at least a share of the way, and radians: other places look similar
+            reach = max(0.3, 0.05 * (topomap.length_m + lengths[-1])), np.deg2rad(15.0)
+            answers = {
+                k: one if one and one.world_from_cam.is_same(by_motion[k], *reach) else None
+                for k, one in answers.items()
+            }
         try:
             aligned = align_motion_to_map(posed.name, odom, answers, config.d_thresh)
         except TrajectoryError:
@@ -227,38 +231,8 @@ class GrowingMap:
         world_from_odom = self._world_from_cams[middle + first] @ odom[middle].inverse()
         return {index: world_from_odom @ pose for index, pose in odom.items()}
 
-    def _way(self, poses: Mapping[int, Rigid3]) -> float:
-        """Return the way (metres) up to the end of a piece, over which motion may have drifted."""
-        _, length_m = self._size()
-        points = np.array([pose.translation for pose in poses.values()])
-        return length_m + float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
     def _write(self, topomap: TopoMetricMap) -> None:
         """Write the map, and go on with the file, so that memory does not grow. Raises MapError."""
         save_map(topomap, self.path, is_old_kept=False)
         self.close()
         self._topomap = TopoMetricMap.load(self.path)
-
-
-def _numbered(poses: Sequence[Rigid3 | None], first: int = 0) -> dict[int, Rigid3]:
-    return {first + index: pose for index, pose in enumerate(poses) if pose is not None}
-
-
-def _plausible(
-    answers: Mapping[int, Localization | None], by_motion: Mapping[int, Rigid3], way_m: float
-) -> dict[int, Localization | None]:
-    """Return the answers without those that are further from the poses by motion than its drift
-    allows: similar places elsewhere."""
-    reach = max(0.3, 0.05 * way_m)  # metres; a share of the way
-
-    def is_near(index: int, answer: Localization) -> bool:
-        return answer.world_from_cam.is_same(by_motion[index], reach, np.deg2rad(15.0))
-
-    return {
-        index: answer if answer is not None and is_near(index, answer) else None
-        for index, answer in answers.items()
-    }
-
-
-def _no_progress(stage: str, done: int, total: int) -> None:
-    """Ignore the progress of a piece."""

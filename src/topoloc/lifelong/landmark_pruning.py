@@ -15,15 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
+from topoloc.mapping.storage.entries import change_each
 from topoloc.mapping.storage.point_encoding import dequantize_descriptors, quantize_descriptors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
-from topoloc.node_ids import LazySequence
 
 # A node counts as quantized if the median norm of its stored descriptors is at most this many times
 # the norm expected for the step.
@@ -38,12 +37,7 @@ def transform_nodes(
     if all(transform(node) is node for layer in topomap.layers.values() for node in layer.nodes):
         return topomap
     layers = {
-        kind: replace(
-            layer,
-            nodes=LazySequence(
-                partial(len, layer.nodes), lambda row, layer=layer: transform(layer.nodes[row])
-            ),
-        )
+        kind: replace(layer, nodes=change_each(layer.nodes, transform))
         for kind, layer in topomap.layers.items()
     }
     return replace(topomap, layers=layers)
@@ -124,16 +118,6 @@ def find_vanished(node: TopoNode) -> Bool[np.ndarray, " n"]:
     return vanished if vanished.sum() <= max_gone_share * num else np.zeros(num, bool)
 
 
-def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
-    """Return each landmark's probability of being seen if it should be visible, over all sessions
-    (Laplace's rule)."""
-    expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
-    for session_statistics in node.session_statistics:
-        expected[session_statistics.rows] += session_statistics.expected
-        seen[session_statistics.rows] += session_statistics.seen
-    return seen / expected
-
-
 def choose_landmarks(
     node: TopoNode, rows: Int[np.ndarray, " m"], most: int
 ) -> Int[np.ndarray, " k"]:
@@ -143,7 +127,12 @@ def choose_landmarks(
     size = node.camera.width / cells
     cell = (node.features.points_img[rows] / size).astype(np.int64)
     key = cell[:, 1] * (cells + 1) + cell[:, 0]
-    chances, gains = _observation_probability(node)[rows], np.empty(len(rows))
+    # the probability of being seen if it should be visible, over all sessions (Laplace's rule)
+    expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
+    for of_session in node.session_statistics:
+        expected[of_session.rows] += of_session.expected
+        seen[of_session.rows] += of_session.seen
+    chances, gains = (seen / expected)[rows], np.empty(len(rows))
     for one in np.unique(key):
         of_cell = np.flatnonzero(key == one)
         best_first = of_cell[np.argsort(-chances[of_cell], kind="stable")]

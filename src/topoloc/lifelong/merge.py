@@ -173,11 +173,10 @@ def _select_images(
     wanted = {(second.summaries[row].session_id, second.summaries[row].name): row for row in new_id}
     found = []
     for image in second.place_images:
-        row = wanted.get((image.session_id, image.name))
-        if row is not None:
-            moved = replace(image, node_id=new_id[row], world_from_cam=poses[row], image_id=None)
+        if (row := wanted.get((image.session_id, image.name))) is not None:
             session_id = session_ids.get(image.session_id, image.session_id)
-            found.append(replace(moved, session_id=session_id))
+            placed = replace(image, node_id=new_id[row], world_from_cam=poses[row])
+            found.append(replace(placed, session_id=session_id, image_id=None))
     return found
 
 

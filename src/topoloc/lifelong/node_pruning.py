@@ -11,16 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Int
 
 from topoloc.mapping.node_drafts import observe_node
 from topoloc.mapping.nodes import find_nearest_nodes
+from topoloc.mapping.storage.entries import change_each
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
-from topoloc.node_ids import LazySequence, NodeId, Row
+from topoloc.node_ids import NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
 
 _PER_VECTOR_ARRAYS = ("vectors", "centres", "cell_vectors")
@@ -125,7 +125,7 @@ def remove_nodes(
             name: _reassign_descriptors(model, new_id)
             for name, model in layer.coarse_models.items()
         }
-        nodes = LazySequence(partial(len, kept), lambda k, nodes=layer.nodes: nodes[kept[k]])
+        nodes = change_each(kept, layer.nodes.__getitem__)
         layers[kind] = replace(layer, nodes=nodes, coarse_models=models)
     sides = topomap.sides
     if sides is not None and any(summary.of_node in new_id for summary in sides.summaries):

@@ -142,9 +142,9 @@ def create_session_content(
         )
         is_of_new = to_new.min(initial=np.inf) <= max(config.d_thresh, to_old.min())
         if is_of_new or frame in covered:
-            image = drafted.get(frame)
-            if image is None:
-                image = extract_mapping_image(frame, frame.view(with_depth=False), config)
+            image = drafted.get(frame) or extract_mapping_image(
+                frame, frame.view(with_depth=False), config
+            )
             content.lights.append(image.light)
             if frame in covered:
                 nearest = as_rows(np.argsort(to_old, kind="stable")[:NODES_PER_IMAGE])
@@ -163,10 +163,11 @@ def create_session_content(
             finish_node(node_id, draft, kind, 400 if draft.frame.index in learnt else 800)
             for node_id, draft in zip(new_ids, drafts, strict=True)
         ]
-    for node_id, draft in zip(new_ids, drafts, strict=True):
-        content.sides.extend(
-            replace(side, summary=replace(side.summary, of_node=node_id)) for side in draft.sides
-        )
+    content.sides.extend(
+        replace(side, summary=replace(side.summary, of_node=node_id))
+        for node_id, draft in zip(new_ids, drafts, strict=True)
+        for side in draft.sides
+    )
     return content
 
 

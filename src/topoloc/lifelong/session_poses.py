@@ -66,17 +66,10 @@ def estimate_poses_by_motion(
     QueryError.
     """
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
-    numbered = [
-        {index: pose for index, pose in enumerate(poses) if pose is not None} for poses in stretches
-    ]
-    motions = [odom for odom in numbered if odom]
+    motions = [odom for poses in stretches if (odom := number_poses(poses))]
     if not motions:
         raise TrajectoryError(f"{sequence.name}: none of its frames has a pose; no map is changed")
-    queried = list[list[int]]()
-    for odom in motions:
-        frames, poses = list(odom), list(odom.values())
-        rows = select_node_frames(poses, map_config.d_thresh, map_config.lambda_rot)
-        queried.append([frames[row] for row in rows])
+    queried = [select_queried_frames(odom, map_config) for odom in motions]
     indices = sorted({index for of_motion in queried for index in of_motion})
     results = list[Localization | NotLocalized]()
     for done, index in enumerate(indices):
@@ -102,6 +95,17 @@ def estimate_poses_by_motion(
     poses = {index: pose for one in aligned for index, pose in one.world_from_cams.items()}
     inlier_idx = sorted(index for one in aligned for index in one.inlier_idx)
     return SessionPoses(poses, answers, inlier_idx)
+
+
+def number_poses(poses: Sequence[Rigid3 | None], first: int = 0) -> dict[int, Rigid3]:
+    """Return the known poses of successive frames by frame. `first` is that of the first one."""
+    return {first + index: pose for index, pose in enumerate(poses) if pose is not None}
+
+
+def select_queried_frames(poses: Mapping[int, Rigid3], config: MapConfig) -> list[int]:
+    """Return the frames, of poses by frame, that are about as far apart as nodes."""
+    frames, own = list(poses), list(poses.values())
+    return [frames[row] for row in select_node_frames(own, config.d_thresh, config.lambda_rot)]
 
 
 def align_motion_to_map(

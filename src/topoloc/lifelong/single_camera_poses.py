@@ -17,6 +17,7 @@ from itertools import groupby
 import numpy as np
 
 from topoloc.errors import CalibrationError, TrajectoryError
+from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.scale_estimation import (
     WIDENED,
@@ -32,12 +33,12 @@ from topoloc.lifelong.session_poses import (
     SLACK_DEG,
     SessionPoses,
     align_motion_to_map,
+    select_queried_frames,
 )
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory, correct_trajectory
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig, Progress
-from topoloc.mapping.nodes import select_node_frames
 from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.monocular_odometry import MonocularOdometry
 from topoloc.tracking.tracker import Tracker
@@ -59,6 +60,7 @@ def estimate_poses_by_map(
     max_sigma = 0.1
     found, odometry = _localize_stream(sequence, tracker, progress)
     d_thresh = map_config.d_thresh
+    limits = SLACK * d_thresh, math.radians(SLACK_DEG)
     localized = {index: answer for index, (_, answer) in found.items()}
     poses = {
         index: pose
@@ -76,22 +78,21 @@ def estimate_poses_by_map(
         for index in odom:
             is_inlier, pose = index in inlier_idx, poses.pop(index, None)
             answer = localized[index] if is_inlier else localized.pop(index, None)
-            if aligned is None:
-                pose = pose if is_inlier else None
+            if aligned is not None:
+                pose = aligned.get(index)
+                # A node that differs from the localization would contradict the map's nodes.
+                is_kept = answer is None or (pose and pose.is_same(answer.world_from_cam, *limits))
             else:
-                pose = _pose_if_consistent(aligned.get(index), answer, d_thresh)
-            if pose is not None:
+                is_kept = is_inlier
+            if pose is not None and is_kept:
                 poses[index] = pose
-    known = sorted(poses.items(), key=lambda pair: pair[0])
-    if not known:
+    if not poses:
         raise TrajectoryError(f"{sequence.name}: {_failure_reason(localized)}; no map is changed")
-    rows = select_node_frames([pose for _, pose in known], d_thresh, map_config.lambda_rot)
-    queried = [known[k][0] for k in rows]
+    known = dict(sorted(poses.items()))
+    queried = select_queried_frames(known, map_config)
     answers = {index: localized.get(index) for index in queried}
-    propagated_idx = [index for index, _ in known if index not in localized]
-    return SessionPoses(
-        poses, answers, [index for index in queried if index in localized], propagated_idx
-    )
+    inlier_idx = [index for index in queried if index in localized]
+    return SessionPoses(poses, answers, inlier_idx, [k for k in known if k not in localized])
 
 
 def _localize_stream(
@@ -224,26 +225,16 @@ def _reject_contradicted(
     # the localization, multiplied by `WIDENED`, are added.
     contradiction = 0.1
     within_stretch = {index: answer for index, answer in localized.items() if index in poses}
-    apart = set[int]()
-    for index, answer in within_stretch.items():
-        tolerance = contradiction * d_thresh + 3.0 * WIDENED * answer.position_sigma_m
-        if not poses[index].is_same(answer.world_from_cam, tolerance, math.inf):
-            apart.add(index)
+    apart = {
+        index
+        for index, answer in within_stretch.items()
+        if translation_error(poses[index], answer.world_from_cam)
+        >= contradiction * d_thresh + 3.0 * WIDENED * answer.position_sigma_m
+    }
     contradicted = _find_contradicted_frames(list(within_stretch), apart)
     left = {index: pose for index, pose in poses.items() if index not in contradicted}
     consistent = [index for index in inlier_idx if index not in apart]
     return (left, consistent) if len(consistent) >= MIN_AGREEING else (None, [])
-
-
-def _pose_if_consistent(
-    pose: Rigid3 | None, answer: Localization | None, d_thresh: float
-) -> Rigid3 | None:
-    """Return the pose, or None if the localization differs from it. A node there would contradict
-    the map's nodes."""
-    if pose is None or answer is None:
-        return pose
-    is_same = pose.is_same(answer.world_from_cam, SLACK * d_thresh, math.radians(SLACK_DEG))
-    return pose if is_same else None
 
 
 def _find_contradicted_frames(answered: list[int], apart: Set[int]) -> set[int]:

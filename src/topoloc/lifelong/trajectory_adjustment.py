@@ -128,10 +128,16 @@ def correct_trajectory(
     correction is smoothed over `d_thresh`, D_thresh of the map in metres."""
     poses = list(world_from_cams.values())
     rows = {index: row for row, index in enumerate(world_from_cams)}
+    # Beyond three sigmas, the pose or the localization is wrong. A correction cannot decide which.
     answered = {
         rows[index]: answer
         for index, answer in answers.items()
-        if index in rows and _is_correctable(world_from_cams[index], answer)
+        if index in rows
+        and world_from_cams[index].is_same(
+            answer.world_from_cam,
+            _MAX_SIGMAS * answer.position_sigma_m,
+            math.radians(_MAX_SIGMAS * answer.rotation_sigma_deg),
+        )
     }
     if not answered:
         return dict(world_from_cams)
@@ -152,16 +158,6 @@ def correct_trajectory(
         index: Rigid3(exp_so3(step[3:]) @ pose.rotation, pose.translation + step[:3])
         for (index, pose), step in zip(world_from_cams.items(), np.transpose(moved), strict=True)
     }
-
-
-def _is_correctable(pose: Rigid3, answer: Localization) -> bool:
-    """Return whether the pose is within three sigmas of the localization. Otherwise one of the two
-    is wrong, and a correction cannot decide which."""
-    return pose.is_same(
-        answer.world_from_cam,
-        _MAX_SIGMAS * answer.position_sigma_m,
-        math.radians(_MAX_SIGMAS * answer.rotation_sigma_deg),
-    )
 
 
 def _estimate_corrections(

@@ -51,8 +51,9 @@ from topoloc.mapping.sessions import Session
 from topoloc.mapping.storage.entries import overlay
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import add_virtual_nodes
-from topoloc.recordings.frame import SequenceView, StereoSequence
+from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import with_poses
 from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
@@ -168,9 +169,8 @@ def update_map(
         )
     else:
         session_poses = estimate_poses_by_motion(sequence, localizer, topomap.config, progress)
-    indices = list(range(len(sequence)))
-    poses = [session_poses.world_from_cams.get(index) for index in indices]
-    posed_sequence = SequenceView(sequence, indices, poses)
+    poses = [session_poses.world_from_cams.get(index) for index in range(len(sequence))]
+    posed_sequence = with_poses(sequence, poses)
     frames = select_posed_frames(posed_sequence, topomap.free_ids.session)
 
     def add_frames(learnt: Collection[int]) -> _Added:

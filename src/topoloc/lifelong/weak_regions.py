@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
@@ -25,8 +25,7 @@ from topoloc.lifelong.node_localization import (
     sample_evenly,
 )
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.nodes import NodePoses
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId, Row
 
 Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
@@ -192,10 +191,9 @@ def find_weak_regions(
     report = None if progress is None else partial(progress, "asking the map without the node")
     answers = localize_left_out(localizer, topomap, rows, beside, report)
     d_thresh = topomap.config.d_thresh
-    has_opposite_view = _has_opposite_view(topomap.node_poses, reach * d_thresh, min_turn_deg)
+    opposite = reach * d_thresh, np.cos(np.deg2rad(min_turn_deg))
     nodes = [
-        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), stood_by)
-        for row in topomap.rows
+        _assess_node(topomap, row, answers.get(row), opposite, stood_by) for row in topomap.rows
     ]
     parts = list[WeakRegion]()
     for reason in REASONS:
@@ -211,7 +209,7 @@ def _assess_node(
     topomap: TopoMetricMap,
     row: Row,
     answer: LeaveOneOutResult | None,
-    has_opposite_view: bool,
+    opposite: tuple[float, float],
     stood_by: float,
 ) -> NodeQuality:
     # The rest of the map must localize a node with at least this many inliers. An update adds
@@ -222,12 +220,16 @@ def _assess_node(
     # a node beside it.
     min_seen_share = 0.2
     node, summary = topomap.nodes[row], topomap.summaries[row]
-    seen_share, reasons = _seen_share(node), list[Reason]()
+    seen, reasons = np.zeros(len(node.features), bool), list[Reason]()  # by other sessions
+    for one in node.session_statistics:
+        if one.session_id != summary.session_id:
+            seen[one.rows[one.seen > 0]] = True
+    seen_share = float(seen.mean()) if len(seen) else 0.0
     if answer is not None and answer.num_inliers < min_inliers:
         reasons.append("not_held")
     if summary.num_points < min_landmarks:
         reasons.append("few_landmarks")
-    if not has_opposite_view:
+    if not topomap.node_poses.has_opposite(row, *opposite):
         reasons.append("one_direction")
     beside = (topomap.summaries[k].session_id for k in find_near_nodes(topomap, row, stood_by))
     if seen_share < min_seen_share and all(one == summary.session_id for one in beside):
@@ -242,27 +244,6 @@ def _assess_node(
         answer,
         tuple(reasons),
     )
-
-
-def _seen_share(node: TopoNode) -> float:
-    """Return the share of a node's landmarks that other sessions saw."""
-    seen = np.zeros(len(node.features), bool)
-    for one in node.session_statistics:
-        if one.session_id != node.summary.session_id:
-            seen[one.rows[one.seen > 0]] = True
-    return float(seen.mean()) if len(seen) else 0.0
-
-
-def _has_opposite_view(
-    poses: NodePoses, reach_m: float, min_turn_deg: float
-) -> Bool[np.ndarray, " nodes"]:
-    """Return for each node whether another one within reach looks in the opposite direction."""
-    axes, found = poses.rotations[:, :, 2], np.zeros(len(poses.centres), bool)
-    max_cos = np.cos(np.deg2rad(min_turn_deg))
-    for row, (centre, axis) in enumerate(zip(poses.centres, axes, strict=True)):
-        is_near = np.linalg.norm(poses.centres - centre, axis=1) <= reach_m
-        found[row] = (is_near & (axes @ axis <= max_cos)).any()
-    return found
 
 
 def _cluster_nodes(nodes: Sequence[NodeQuality], apart_m: float) -> list[list[NodeQuality]]:

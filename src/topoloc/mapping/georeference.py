@@ -52,8 +52,8 @@ def read_control_points(path: Path) -> ControlPoints:
     """
     found = []
     for line, columns in _read_table(path, 6, 0, "x, y, z, lat, lon, h"):
-        numbers = _parse_numbers(path, line, columns[:6])
-        found.append((numbers[:3], _parse_geo_point(path, line, numbers[3:]), f"line {line}"))
+        point = _parse_numbers(path, line, columns[:3])
+        found.append((point, _parse_geo_point(path, line, columns[3:6]), f"line {line}"))
     return ControlPoints.of(found)
 
 
@@ -66,10 +66,7 @@ def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
     place is not on earth, or no line matches the map. It names the line.
     """
     rows = _read_table(path, 4, 1, "time or name, lat, lon, h")
-    places = [
-        _parse_geo_point(path, line, _parse_numbers(path, line, columns[1:4]))
-        for line, columns in rows
-    ]
+    places = [_parse_geo_point(path, line, columns[1:4]) for line, columns in rows]
     positions = _find_positions_by_name(topomap)
     named = [
         (positions[columns[0]], place, columns[0])
@@ -163,7 +160,8 @@ def _is_number(text: str) -> bool:
     return number.is_finite() and abs(number.adjusted()) < 300
 
 
-def _parse_geo_point(path: Path, line: int, values: Sequence[float]) -> GeoPoint:
+def _parse_geo_point(path: Path, line: int, columns: Sequence[str]) -> GeoPoint:
+    values = _parse_numbers(path, line, columns)
     with GeoreferenceError.at(f"{path}, line {line}"):
         return GeoPoint(*values)
 
@@ -223,12 +221,10 @@ def georeference(
             placed = georeference_from_heading(posed[0], *origin, direction)
             fit = GeoreferenceFit(placed, np.zeros(0), np.zeros(0, dtype=bool))
         else:
-            source = "points" if points is not None else "gnss"
-            path_of_known = Path(points or gnss or "")
             if points is not None:
-                known, direction = read_control_points(path_of_known), None
+                known, source, direction = read_control_points(Path(points)), "points", None
             else:
-                known = read_gnss(path_of_known, topomap)
+                known, source = read_gnss(Path(gnss or ""), topomap), "gnss"
             names = known.names
             fit = fit_georeference(known.points_world, known.places, source, direction)
         found = fit.georeference

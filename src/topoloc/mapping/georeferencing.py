@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.alignment import nearest_rotation
 from topoloc.geometry.geodesy import GeoPoint, Georeference
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.geometry.transform_consensus import find_least_median
 
 UP_ENU = np.array([0.0, 0.0, 1.0])
@@ -101,15 +101,7 @@ def georeference_from_heading(
         )
     north = level / np.linalg.norm(level)  # rows: east, north, up if the image looked north
     axes = np.array([np.cross(north, up.world), north, up.world])
-    heading = math.radians(heading_deg)
-    turn = np.array(
-        [
-            [math.cos(heading), math.sin(heading), 0.0],
-            [-math.sin(heading), math.cos(heading), 0.0],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    rotation = turn @ axes
+    rotation = exp_so3(-math.radians(heading_deg) * UP_ENU) @ axes
     return Georeference(origin, Rigid3(rotation, -rotation @ world_from_cam.translation), "origin")
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Float, Float16, Int, Int16, UInt16
@@ -97,7 +98,7 @@ class LandmarkStatistics:
         return len(self.rows) > 0 and is_empty
 
     def with_counts(self, counted: LandmarkStatistics) -> LandmarkStatistics:
-        """Return the statistics with the counts of further images of the same session."""
+        """Return the statistics with the counts of further images, of the same session or not."""
         rows = np.union1d(self.rows, counted.rows)
         roots = np.zeros((len(rows), 6), np.float16)
         roots[:, [0, 2, 5]] = _MIN_INFORMATION**0.5
@@ -133,15 +134,8 @@ def merge_count_statistics(statistics: Iterable[LandmarkStatistics]) -> list[Lan
 
 def _add_counts(parts: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
     """Add up the counts of several sessions under the id of the last one."""
-    last = max(parts, key=lambda part: part.session_id)
-    if len(parts) == 1:
-        return last
-    num = 1 + max(int(part.rows[-1]) for part in parts)
-    expected, seen = np.zeros(num, np.int64), np.zeros(num, np.int64)
-    for part in parts:
-        expected[part.rows] += part.expected
-        seen[part.rows] += part.seen
-    return LandmarkStatistics.of_counts(last.session_id, expected, seen)
+    *others, last = sorted(parts, key=lambda part: part.session_id)
+    return reduce(LandmarkStatistics.with_counts, others, last)
 
 
 def encode_statistics(statistics: LandmarkStatistics) -> bytes:

@@ -174,34 +174,15 @@ def _normal_equations(
     information, gradient = prior.copy(), np.einsum("nij,nj->ni", prior, offset)
     squares = np.einsum("ni,ni->n", gradient, offset)
     for seen in observations:
-        pose = seen.cam_from_node
-        _add_observations(
-            points,
-            seen.rows,
-            seen.normalized,
-            seen.sigmas,
-            pose.rotation,
-            pose.translation,
-            _CAUCHY_SCALE,
-            information,
-            gradient,
-            squares,
-        )
+        pose = seen.cam_from_node.rotation, seen.cam_from_node.translation
+        seen_at = seen.rows, seen.normalized, seen.sigmas
+        _add_observations(points, *seen_at, *pose, information, gradient, squares)
     return information, gradient, squares
 
 
 @kernel(error_model="numpy")
 def _add_observations(
-    points,
-    rows,
-    normalized,
-    sigmas,
-    rotation,
-    translation,
-    cauchy_scale,
-    information,
-    gradient,
-    squares,
+    points, rows, normalized, sigmas, rotation, translation, information, gradient, squares
 ):
     """Add observations of one image to `information`, `gradient` and `squares`, which have one row
     per point.
@@ -229,7 +210,7 @@ def _add_observations(
             for i in range(3):
                 jacobian[k, i] = rotation[k, i] / depth - projected / depth * rotation[2, i]
         squares[n] += square
-        weight = 1.0 / (1.0 + square / cauchy_scale**2) / sigma**2
+        weight = 1.0 / (1.0 + square / _CAUCHY_SCALE**2) / sigma**2
         for i in range(3):
             a, b = weight * jacobian[0, i], weight * jacobian[1, i]
             gradient[n, i] += a * residual[0] + b * residual[1]

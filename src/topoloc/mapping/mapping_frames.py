@@ -15,12 +15,12 @@ from itertools import chain, groupby, pairwise
 from typing import TypeVar
 
 import cv2
-import numpy as np
 
 from topoloc.errors import TrajectoryError
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_map
+from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
@@ -79,11 +79,8 @@ class MappingImage:
 
 def prepare_view(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
     """Prepare a frame for measurements. Monocular images have no depth in any case."""
-    return prepare_frame(frame, with_depth and not _is_monocular(frame))
-
-
-def _is_monocular(frame: StereoFrame) -> bool:
-    return frame.right is None and frame.depth is None
+    is_monocular = frame.right is None and frame.depth is None
+    return prepare_frame(frame, with_depth and not is_monocular)
 
 
 def select_posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame]:
@@ -134,12 +131,8 @@ def create_session(
 
 def compute_trajectory_length(frames: Sequence[MappingFrame]) -> float:
     """Return the length in metres of the trajectories of all recordings together."""
-    steps = [
-        b.world_from_cam.translation - a.world_from_cam.translation
-        for a, b in pairwise(frames)
-        if a.sequence is b.sequence
-    ]
-    return float(sum(np.linalg.norm(step) for step in steps))
+    steps = ((a, b) for a, b in pairwise(frames) if a.sequence is b.sequence)
+    return sum((translation_error(a.world_from_cam, b.world_from_cam) for a, b in steps), 0.0)
 
 
 def connect_nodes(frames: Sequence[MappingFrame], node_ids: Sequence[NodeId]) -> set[Edge]:
@@ -193,9 +186,8 @@ class PointLocator:
 
     def __init__(self, frames: Sequence[MappingFrame], config: MapConfig) -> None:
         self._config = config
-        self._sessions: dict[int, list[MappingFrame]] = {}
-        for frame in frames:
-            self._sessions.setdefault(frame.session_id, []).append(frame)
+        sessions = groupby(frames, lambda frame: frame.session_id)
+        self._sessions = {number: list(of_it) for number, of_it in sessions}
         self._steps = {
             number: compute_median_step([frame.world_from_cam for frame in of_it])
             for number, of_it in self._sessions.items()
@@ -231,7 +223,11 @@ class PointLocator:
         """Return the positions of a frame's features by type, and the other frames that are needed:
         those used to triangulate them, or, if they have coarse depth, those that are to observe
         them (`image_of`)."""
-        others = [] if view.is_located else self._select_others(frame)
+        others: list[MappingFrame] = []
+        if not view.is_located:
+            frames, step = self._sessions[frame.session_id], self._steps[frame.session_id]
+            poses = [other.world_from_cam for other in frames]
+            others = [frames[k] for k in select_source_images(poses, frames.index(frame), step)]
         if view.is_located or view.depth is not None:
             of_kind = image.features.items()
             return {kind: locate_points(features, view) for kind, features in of_kind}, others
@@ -258,8 +254,3 @@ class PointLocator:
             return self.image(frame, prepare_view(read, with_depth=False))
         self._image_cache.move_to_end(id(frame))
         return self._image_cache[id(frame)]
-
-    def _select_others(self, frame: MappingFrame) -> list[MappingFrame]:
-        frames, step = self._sessions[frame.session_id], self._steps[frame.session_id]
-        poses = [other.world_from_cam for other in frames]
-        return [frames[k] for k in select_source_images(poses, frames.index(frame), step)]

@@ -67,6 +67,13 @@ class NodePoses:
         """Return the poses of some nodes."""
         return NodePoses(self.centres[rows], self.rotations[rows])
 
+    def has_opposite(self, row: int, reach_m: float, max_cos: float) -> bool:
+        """Return whether a node within reach (metres) of a node looks in the opposite direction.
+        The cosine of the angle between their axes is then at most `max_cos`."""
+        is_near = np.linalg.norm(self.centres - self.centres[row], axis=1) <= reach_m
+        axes = self.rotations[:, :, 2]
+        return bool((is_near & (axes @ axes[row] <= max_cos)).any())
+
     def plan_svg(self, size_px: int = 320) -> str:
         """Return a plan of the nodes in the plane of their main directions, with a bar whose length
         is written beside it, as SVG of some kilobytes."""

@@ -18,10 +18,10 @@ from jaxtyping import Float, Float32
 
 from topoloc.disk_list import DiskList
 from topoloc.features.extraction import FeatureConfig, extract_features
-from topoloc.features.virtual_views import VirtualView, make_virtual_views
+from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.nodes import select_node_frames
+from topoloc.mapping.nodes import NodePoses, select_node_frames
 from topoloc.mapping.storage.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId, Row, as_rows
@@ -39,17 +39,10 @@ def select_virtual_view_nodes(world_from_nodes: list[Rigid3], config: MapConfig)
     spacing = config.sides.spacing
     if spacing == 0.0:
         return set()
-    reach = max_opposite * config.d_thresh
-    centres = np.array([pose.translation for pose in world_from_nodes])
-    axes = np.array([pose.rotation[:, 2] for pose in world_from_nodes])
-
-    def has_opposite_node(k: int) -> bool:
-        near = np.linalg.norm(centres - centres[k], axis=1) < reach
-        return bool((near & (axes @ axes[k] < -0.7)).any())
-
+    poses, reach = NodePoses.of(world_from_nodes), max_opposite * config.d_thresh
     d_thresh, lambda_rot = spacing * config.d_thresh, config.lambda_rot / 2.0
     rows = as_rows(select_node_frames(world_from_nodes, d_thresh, lambda_rot))
-    return {row for row in rows if not has_opposite_node(row)}
+    return {row for row in rows if not poses.has_opposite(row, reach, -0.7)}
 
 
 def find_new_virtual_views(topomap: TopoMetricMap, world_from_cams: Sequence[Rigid3]) -> set[int]:
@@ -76,17 +69,32 @@ def add_virtual_nodes(topomap: TopoMetricMap, new_nodes: Sequence[TopoNode]) -> 
 def create_virtual_nodes(
     of_node: NodeSummary,
     view: PreparedFrame,
-    features: FeatureConfig,
+    feature_config: FeatureConfig,
     max_points: int = 400,
     min_points: int = 20,
 ) -> list[TopoNode]:
     """Return the virtual nodes of a node's image, at most two, without ids. Each keeps the
     `max_points` strongest features. A virtual view with fewer than `min_points` becomes none."""
-    sides = (
-        _create_virtual_node(of_node, view, virtual_view, features, max_points, min_points)
-        for virtual_view in make_virtual_views(view.camera)
-    )
-    return [node for node in sides if node is not None]
+    nodes = list[TopoNode]()
+    for virtual_view in make_virtual_views(view.camera):
+        extracted = extract_features(virtual_view.picture(view.grey), feature_config)
+        features = virtual_view.select_inside(extracted)
+        located = locate_points(virtual_view.to_image_pixels(features, view.camera), view)
+        # points too slanted from the virtual camera are not on the wall in front of it
+        side_from_cam = virtual_view.cam_from_virtual.inverse()
+        points_side = side_from_cam.apply(located.points_cam)
+        with np.errstate(invalid="ignore"):
+            in_front = located.valid & (points_side[:, 2] > 0.1 * located.points_cam[:, 2])
+        rows = np.flatnonzero(in_front)[:max_points]
+        if len(rows) >= min_points:
+            pose = of_node.world_from_cam @ virtual_view.cam_from_virtual
+            summary = replace(of_node, world_from_cam=pose, num_points=len(rows))
+            turn, points = side_from_cam.rotation, points_side[rows].astype(np.float32)
+            roots = np.linalg.cholesky(turn @ located.covariances[rows] @ turn.T)
+            roots = roots[:, *np.tril_indices(3)].astype(np.float32)
+            seen = features.select(rows)
+            nodes.append(TopoNode(summary, virtual_view.camera, seen, points, roots, b""))
+    return nodes
 
 
 def collect_virtual_nodes(described: Sequence[TopoNode], kind: str) -> VirtualNodes | None:
@@ -101,39 +109,6 @@ def collect_virtual_nodes(described: Sequence[TopoNode], kind: str) -> VirtualNo
     model, centres = _fit_vlad(nodes).to_model(), np.array([*map(_median_point_world, nodes)])
     model = replace(model, arrays={**model.arrays, "centres": centres})
     return VirtualNodes([node.summary for node in nodes], nodes, {model.name: model}, kind)
-
-
-def _create_virtual_node(
-    of_node: NodeSummary,
-    view: PreparedFrame,
-    virtual_view: VirtualView,
-    feature_config: FeatureConfig,
-    max_points: int,
-    min_points: int,
-) -> TopoNode | None:
-    features = virtual_view.select_inside(
-        extract_features(virtual_view.picture(view.grey), feature_config)
-    )
-    located = locate_points(virtual_view.to_image_pixels(features, view.camera), view)
-    # points too slanted from the virtual camera are not on the wall in front of it
-    side_from_cam = virtual_view.cam_from_virtual.inverse()
-    points_side = side_from_cam.apply(located.points_cam)
-    with np.errstate(invalid="ignore"):
-        in_front = located.valid & (points_side[:, 2] > 0.1 * located.points_cam[:, 2])
-    rows = np.flatnonzero(in_front)[:max_points]
-    if len(rows) < min_points:
-        return None
-    turn = side_from_cam.rotation
-    roots = np.linalg.cholesky(turn @ located.covariances[rows] @ turn.T)
-    pose = of_node.world_from_cam @ virtual_view.cam_from_virtual
-    return TopoNode(
-        replace(of_node, world_from_cam=pose, num_points=len(rows)),
-        virtual_view.camera,
-        features.select(rows),
-        points_side[rows].astype(np.float32),
-        roots[:, *np.tril_indices(3)].astype(np.float32),
-        b"",
-    )
 
 
 def _median_point_world(node: TopoNode) -> Float[np.ndarray, " 3"]:

@@ -101,7 +101,7 @@ def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, 
 
 
 @kernel(**_OPTIONS)
-def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
+def _refine_disparity(patch, half, right, x, y, disparity):
     """Refine a disparity with Gauss-Newton, with gain and offset eliminated. Return (disparity,
     standard deviation in pixels)."""
     side = 2 * half + 1
@@ -109,7 +109,7 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
     sigma = np.float32(np.inf)
     window, slope = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
     samples = np.empty(side + 2, np.float32)  # of a row, and one more at each end
-    for _ in range(num_iterations):
+    for _ in range(8):
         xr = x - disparity
         if xr - half - 1 < 0 or xr + half + 2 >= width:
             return disparity, np.float32(np.inf)
@@ -177,9 +177,8 @@ def _match_point(
             second = scores[d]
     if second > max_ratio * scores[best]:
         return nothing
-    disparity, sigma = _refine_disparity(
-        patch, half, right, x, y, np.float32(min_disparity + best), 8
-    )
+    start = np.float32(min_disparity + best)
+    disparity, sigma = _refine_disparity(patch, half, right, x, y, start)
     xr = x - disparity
     is_beside = xr < half or xr >= width - half - 1
     if is_beside or not np.isfinite(sigma) or abs(disparity - min_disparity - best) > 1.5:

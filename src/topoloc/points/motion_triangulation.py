@@ -129,9 +129,8 @@ def _fuse_depths(
         return np.full(len(columns), np.nan), np.full(len(columns), np.nan)
     spread = gate * np.sqrt(sigma[:, None] ** 2 + sigma[None] ** 2 + own_sigma**2)
     with np.errstate(invalid="ignore"):
-        agrees = (
-            np.abs(inverse[:, None] - inverse[None]) <= spread
-        )  # an unknown depth (NaN) agrees with none
+        # an unknown depth (NaN) agrees with none
+        agrees = np.abs(inverse[:, None] - inverse[None]) <= spread
     support = agrees.sum(axis=1)
     best = np.lexsort((np.nan_to_num(sigma, nan=np.inf), -support), axis=0)[0]
     chosen = agrees[best, :, columns].T

@@ -84,12 +84,10 @@ def camera_from_intrinsics(
             by 90 degrees.
     """
     camera = Camera.pinhole(width, height, fx, fy, cx, cy)
-    across, down = (2.0 * cx + 1.0) / width, (2.0 * cy + 1.0) / height
+    its_width, its_height = 2.0 * cx + 1.0, 2.0 * cy + 1.0
+    across, down = its_width / width, its_height / height
     if min(across, down) > 0.0 and max(abs(across - 1.0), abs(down - 1.0)) > _SIZE_TOLERANCE:
-        its_width, its_height = 2.0 * cx + 1.0, 2.0 * cy + 1.0
-        is_turned = _is_close(its_width, height, _SIZE_TOLERANCE) and _is_close(
-            its_height, width, _SIZE_TOLERANCE
-        )
+        is_turned = _is_close(its_width, height) and _is_close(its_height, width)
         is_inside = 0.0 < cx < width and 0.0 < cy < height
         if is_turned or _is_close(across, down, _SCALE_TOLERANCE) or not is_inside:
             other = (
@@ -209,5 +207,5 @@ def first_image_size(images: Sequence[Path], as_stored: bool = False) -> tuple[i
     return 0, 0
 
 
-def _is_close(one: float, other: float | int, tolerance: float) -> bool:
+def _is_close(one: float, other: float, tolerance: float = _SIZE_TOLERANCE) -> bool:
     return abs(one - other) <= tolerance * other

@@ -48,9 +48,14 @@ def read_camera_json(path: Path) -> CameraCalibration:
         if data.left is None and data.right is None:
             camera = Camera.from_json(whole)
             rig = None if data.baseline is None else StereoRig.rectified(camera, data.baseline)
+        elif data.left is None or data.right is None or data.right_from_left is None:
+            raise CalibrationError(
+                'a stereo pair has "left", "right" and "right_from_left" (4x4, metres)'
+            )
         else:
-            rig = data.stereo_rig()
-            camera = rig.left
+            camera = Camera.from_json(data.left, "left")
+            right = Camera.from_json(data.right, "right")
+            rig = StereoRig(camera, right, data.right_from_left)
     return CameraCalibration(camera, rig, data.depth_factor)
 
 
@@ -62,15 +67,3 @@ class _CameraFile(Struct, frozen=True):
     left: dict[str, Any] | None = None
     right: dict[str, Any] | None = None
     right_from_left: Rigid3 | None = None
-
-    def stereo_rig(self) -> StereoRig:
-        """Return the stereo pair. Raises CalibrationError."""
-        if self.left is None or self.right is None or self.right_from_left is None:
-            raise CalibrationError(
-                'a stereo pair has "left", "right" and "right_from_left" (4x4, metres)'
-            )
-        return StereoRig(
-            Camera.from_json(self.left, "left"),
-            Camera.from_json(self.right, "right"),
-            self.right_from_left,
-        )

@@ -69,10 +69,8 @@ def complete_lists(num: int | None, *lists: list[Path]) -> list[list[Path]]:
     """
     series = [list(map(_number, paths)) for paths in lists]
     found = [dict(zip(*pair, strict=True)) for pair in zip(series, lists, strict=True)]
-    is_unique, numbers = (
-        all(map(len, lists)) and list(map(len, found)) == list(map(len, lists)),
-        series[0],
-    )
+    is_unique = all(map(len, lists)) and list(map(len, found)) == list(map(len, lists))
+    numbers = series[0]
     if any(one != numbers for one in series):
         every = {number for one in found for number in one}
         num_common = sum(all(number in one for one in found) for number in every)

@@ -94,7 +94,7 @@ def find_frame_problem(frame: StereoFrame) -> str | None:
         or find_time_problem(frame.t_ns)
         or _find_size_problem("the picture", frame.image, frame.camera)
         or _find_pose_problem(frame.world_from_cam)
-        or _find_stereo_problem(frame.camera, frame.image, frame.right, frame.rig)
+        or _find_stereo_problem(frame, frame.right, frame.rig)
         or _find_depth_problem(frame.depth)
     )
 
@@ -106,19 +106,17 @@ def _find_pose_problem(pose: Any) -> str | None:
     return f"world_from_cam is a Rigid3, not {type(pose).__name__}; {mend}"
 
 
-def _find_stereo_problem(
-    camera: Camera | None, image: np.ndarray, right: Any, rig: StereoRig | None
-) -> str | None:
+def _find_stereo_problem(frame: StereoFrame, right: Any, rig: StereoRig | None) -> str | None:
     if right is None and rig is None:
         return None
     if right is None or rig is None:
         return (
             f"a stereo pair needs `right` and `rig`; {'rig' if rig is None else 'right'} is missing"
         )
-    if camera != rig.left:
+    if frame.camera != rig.left:
         return "`camera` is that of the left picture, rig.left, and here is another one"
     problem = find_image_problem(right) or _find_size_problem("the right picture", right, rig.right)
-    if problem is None and right.shape[:2] != image.shape[:2]:
+    if problem is None and right.shape[:2] != frame.image.shape[:2]:
         problem = "the left and right picture differ in size"
     return problem
 

@@ -134,7 +134,7 @@ def find_format(
         return format
     if str(camera).endswith(".conf") and Video.can_open(folder):
         return "zed"
-    if found := next((name for name in FORMATS if load_format(name).can_open(folder)), None):
+    if found := _recognise(folder):
         return found
     names = sorted(os.listdir(folder)) if folder.is_dir() else ["a file of another kind"]
     if not names:
@@ -159,13 +159,12 @@ def find_format(
 def _recordings_below(folder: Path) -> list[tuple[Path, str]]:
     """Return the recordings directly inside a folder, each with its format."""
     max_entries = 200
-    if not folder.is_dir():
-        return []
-    found = []
-    for path in sorted(folder.iterdir())[:max_entries]:
-        name = next((name for name in FORMATS if load_format(name).can_open(path)), None)
-        found += [] if name is None else [(path, name)]
-    return found
+    paths = sorted(folder.iterdir())[:max_entries] if folder.is_dir() else []
+    return [(path, name) for path in paths if (name := _recognise(path))]
+
+
+def _recognise(path: Path) -> str | None:
+    return next((name for name in FORMATS if load_format(name).can_open(path)), None)
 
 
 def split_selection(path: str) -> tuple[Path, str | None]:

@@ -139,11 +139,9 @@ def with_poses(
 
 def has_scale(sequence: StereoSequence) -> bool:
     """Return whether the poses are in metres, as far as is known."""
-    while isinstance(sequence, SequenceView):
-        if sequence.has_own_poses:
-            return True  # replaced poses are metric
-        sequence = sequence.base
-    return not isinstance(sequence, Recording) or sequence.has_scale
+    base, are_own = _base_of(sequence), find_pose_source(sequence) == "truth"
+    # replaced poses are metric
+    return not (are_own and isinstance(base, Recording)) or base.has_scale
 
 
 def scale_poses(sequence: StereoSequence, metres: float) -> StereoSequence:

@@ -37,13 +37,18 @@ class ClassifierNetworkConfig:
 
 
 @dataclass(frozen=True)
-class PooledNetworkConfig:
-    """Hold the settings of cnn-nn's network: pooled features of a pretrained network."""
+class VladNetworkConfig(ClassifierNetworkConfig):
+    """Hold the settings of vlad-nn's network: NetVLAD of a network's features."""
 
-    picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
     """Number of layers of the backbone's `features` that are used (None: the best measured number
     for each backbone)."""
+
+
+@dataclass(frozen=True)
+class PooledNetworkConfig(VladNetworkConfig):
+    """Hold the settings of cnn-nn's network: pooled features of a pretrained network."""
+
     grid_rows: Annotated[int, Between(1, 32)] = 2
     """Rows of pooling cells. Cells help because neighbouring nodes see the same objects at other
     image positions."""
@@ -52,16 +57,6 @@ class PooledNetworkConfig:
     power: Annotated[float, Between(1, 100)] = 3.0
     """Exponent of the generalised mean (Radenovic et al. 2018): 1 is the mean, infinity the
     maximum."""
-
-
-@dataclass(frozen=True)
-class VladNetworkConfig:
-    """Hold the settings of vlad-nn's network: NetVLAD of a network's features."""
-
-    picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
-    depth: Annotated[int | None, Between(1, 100)] = None
-    """Number of layers of the backbone's `features` that are used (None: the best measured number
-    for each backbone)."""
 
 
 RgbImage = UInt8[np.ndarray, "_ _ 3"]

@@ -44,11 +44,8 @@ class FrameTracker:
         )
 
     def _update_last_frame(self, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3) -> None:
-        moved = (
-            cam_from_world @ self._last_frame.cam_from_world.inverse()
-            if self._last_frame is not None
-            else None
-        )
+        last = self._last_frame
+        moved = None if last is None else cam_from_world @ last.cam_from_world.inverse()
         self._history.add_pose(t_ns, cam_from_world, moved)
         self._last_frame = LastFrame(measured, cam_from_world)
 

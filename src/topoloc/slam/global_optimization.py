@@ -22,16 +22,13 @@ def join_submaps(
 
     Return the joined sub-maps, including `first`.
     """
-    joined, remaining = [first], list(links)
+    joined = [first]
+
+    def is_joined(row: int) -> bool:
+        return keyframes[row].submap in joined
+
     while True:
-        crossing = next(
-            (
-                k
-                for k in remaining
-                if (keyframes[k.source].submap in joined) != (keyframes[k.target].submap in joined)
-            ),
-            None,
-        )
+        crossing = next((k for k in links if is_joined(k.source) != is_joined(k.target)), None)
         if crossing is None:
             return joined
         known, new = keyframes[crossing.source], keyframes[crossing.target]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -163,11 +163,9 @@ def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
     target_from_source = link.match.target_from_source
     if source.submap > target.submap:
         source, target, target_from_source = target, source, target_from_source.inverse()
-    passed: dict[int, list[KeyFrame]] = {}
-    for keyframe in keyframes:
-        if source.submap <= keyframe.submap <= target.submap:
-            passed.setdefault(keyframe.submap, []).append(keyframe)
-    submaps = [passed[number] for number in sorted(passed)]
+    ordered = sorted(keyframes, key=lambda k: k.submap)
+    passed = (k for k in ordered if source.submap <= k.submap <= target.submap)
+    submaps = [list(own) for _, own in groupby(passed, lambda k: k.submap)]
     expected = source.cam_from_world @ submaps[0][-1].cam_from_world.inverse()
     reaches, turns = list[float](), list[float]()
     max_speeds = [_max_speeds(submap) for submap in submaps]

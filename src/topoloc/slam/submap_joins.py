@@ -197,7 +197,10 @@ def _is_join_verified(
     num_cells = 4  # across and down an image
     counts = np.zeros(3, np.int64)  # points that must look the same, matched ones, those in cells
     for source, target, rows in _find_overlapping_views(consensus.a_from_b, keyframes, ends):
-        cells = _compute_cells(keyframes[source], num_cells)
+        camera, features = keyframes[source].stereo.camera, keyframes[source].place.features
+        columns_rows = num_cells * features.points_img / [camera.width, camera.height]
+        columns_rows = np.clip(np.floor(columns_rows).astype(np.int64), 0, num_cells - 1)
+        cells = columns_rows @ [1, num_cells]  # of each feature
         seen = np.bincount(cells[rows], minlength=num_cells**2)
         found = np.zeros_like(seen)
         link = match_keyframes(source, target, keyframes, min_known_pose, min_inlier_share=0.0)
@@ -210,15 +213,6 @@ def _is_join_verified(
     num_seen, num_found, num_covered = counts.tolist()
     enough = num_found >= min_seen_again * num_seen and num_covered >= min_covered * num_seen
     return num_seen >= min_seen_points and enough
-
-
-def _compute_cells(keyframe: KeyFrame, num_cells: int) -> Int[np.ndarray, " n"]:
-    """Return the grid cell of each feature in its image."""
-    camera = keyframe.stereo.camera
-    columns_rows = np.floor(
-        num_cells * keyframe.place.features.points_img / [camera.width, camera.height]
-    ).astype(np.int64)
-    return np.clip(columns_rows, 0, num_cells - 1) @ [1, num_cells]
 
 
 def _find_overlapping_views(

@@ -100,11 +100,8 @@ class CameraPrior:
 
     def of(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
         """Return mean and covariance of the parameters under a hypothesis."""
-        mean, focal = (
-            unchanged_camera(),
-            self.stated if hypothesis.is_focal_stated else self.usual,
-        )
-        priors = _priors()
+        focal = self.stated if hypothesis.is_focal_stated else self.usual
+        mean, priors = unchanged_camera(), _priors()
         offsets = [
             side * priors.off_centre_sigma
             if axis in hypothesis.off_centre

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar, no_type_check
 
 import numpy as np
@@ -33,6 +34,11 @@ def overlay(base: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> 
         return base[row] if row < len(base) else added[row - len(base)]
 
     return LazySequence(lambda: len(base) + len(added), read)
+
+
+def change_each(entries: Sequence[K], change: Callable[[K], T]) -> LazySequence[T]:
+    """Return the entries, each changed at every access."""
+    return LazySequence(partial(len, entries), lambda row: change(entries[row]))
 
 
 class LazyMapping(Mapping[K, T]):

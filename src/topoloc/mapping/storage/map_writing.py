@@ -155,16 +155,14 @@ class _Writer:
             "counts": json.dumps(counts),
             "map_id": topomap.id,
         }
-        if changes := {
-            str(edit.edit_id): dict(edit.changes) for edit in topomap.edits if edit.changes
-        }:
-            facts["changes"] = json.dumps(changes)
-        if topomap.sides is not None:
-            facts["kind_of_sides"] = json.dumps(topomap.sides.kind)
-        if topomap.georeference is not None:
-            facts["georeference"] = json.dumps(topomap.georeference.to_json())
-        if topomap.certificate is not None:
-            facts["certificate"] = json.dumps(topomap.certificate.to_json())
+        changes = {str(edit.edit_id): dict(edit.changes) for edit in topomap.edits if edit.changes}
+        optional = {
+            "changes": changes or None,
+            "kind_of_sides": topomap.sides and topomap.sides.kind,
+            "georeference": topomap.georeference and topomap.georeference.to_json(),
+            "certificate": topomap.certificate and topomap.certificate.to_json(),
+        }
+        facts |= {key: json.dumps(value) for key, value in optional.items() if value is not None}
         for kind, layer in topomap.layers.items():
             if layer.shared_errors is not None:
                 key = f"shared_errors{layer_suffix(kind, topomap.kind)}"

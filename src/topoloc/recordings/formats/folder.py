@@ -89,12 +89,10 @@ def _open_pairs(
     elif not is_stereo and found and found.depth_factor:
         depth = DepthImages(others, found.depth_factor, None, Rigid3.identity())
     else:
-        need = (
-            '"baseline" in metres or two cameras, or the YAML of OpenCV or Kalibr'
-            if is_stereo
-            else '"depth_factor" in units a metre'
-        )
-        kind = "a stereo pair" if is_stereo else "RGB-D"
+        kind, need = "RGB-D", '"depth_factor" in units a metre'
+        if is_stereo:
+            need = '"baseline" in metres or two cameras, or the YAML of OpenCV or Kalibr'
+            kind = "a stereo pair"
         raise CalibrationError(
             f"{path / FILE_NAME}: {kind} ({name}/, {other}/) needs this file, with a {need}"
         )
