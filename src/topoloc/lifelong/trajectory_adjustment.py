@@ -65,11 +65,11 @@ def adjust_trajectory(
     ]
     limits = {"max_steps": 30, "min_decrease": 1e-5, "cauchy_scale": 0.5}
     adjust_bundle(keyframes, [], stretch.landmarks, map_anchors, **limits)
-    adjusted = dict(world_from_cams)
-    for index, frame in frames.items():
-        view_from_world = relative[index] @ frame.keyframe.cam_from_world
-        adjusted[index] = view_from_world.inverse() @ frame.view_from_cam
-    return adjusted
+    adjusted = {
+        index: (relative[index] @ frame.keyframe.cam_from_world).inverse() @ frame.view_from_cam
+        for index, frame in frames.items()
+    }
+    return {**world_from_cams, **adjusted}
 
 
 def _keyframe_anchor(
