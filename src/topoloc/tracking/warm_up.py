@@ -17,7 +17,7 @@ from jaxtyping import Float32, UInt8
 from topoloc.compiled import is_cached
 from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import FeatureConfig, extract_features
-from topoloc.features.matching import match_features
+from topoloc.features.matching import largest_similarities, match_features
 from topoloc.features.surf_detector_kernels import integral_image
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -66,6 +66,7 @@ def warm_up(
         def features() -> None:
             first, second = (extract_features(picture, FeatureConfig()) for picture in pictures[:2])
             matches = match_features(first.descriptors, second.descriptors, MatchingConfig())
+            largest_similarities(first.descriptors, [second.descriptors])  # of an unclear image
             nowhere = np.zeros((len(second), 5), np.float32)  # maps of SURF alone need this kernel
             count_consistent_displacements(first, matches, nowhere, _CAMERA, within_px=1.0)
 
