@@ -87,7 +87,7 @@ def camera_from_intrinsics(
     its_width, its_height = 2.0 * cx + 1.0, 2.0 * cy + 1.0
     across, down = its_width / width, its_height / height
     if min(across, down) > 0.0 and max(abs(across - 1.0), abs(down - 1.0)) > _SIZE_TOLERANCE:
-        is_turned = _is_close(its_width, height) and _is_close(its_height, width)
+        is_turned = _is_close(its_width, float(height)) and _is_close(its_height, float(width))
         is_inside = 0.0 < cx < width and 0.0 < cy < height
         if is_turned or _is_close(across, down, _SCALE_TOLERANCE) or not is_inside:
             other = (

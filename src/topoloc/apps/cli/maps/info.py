@@ -90,7 +90,7 @@ def _print(info: dict[str, Any]) -> None:
     extent = " x ".join(f"{e:.1f}" for e in info["extent_m"])
     d_thresh, lambda_rot = (nodes.get(name, nan) for name in ("d_thresh", "lambda_rot"))
     kinds = ", ".join(info["kinds"]) + (f", normalization {normalization}" * bool(normalization))
-    floors = "yes" if info["config"].get("look_alike_floors") else "no"
+    floors = "look alike" if info["config"].get("look_alike_floors") else "do not look alike"
     of_sessions = [f"{one['name']} ({one['num_nodes']} nodes)" for one in info["sessions"]]
     print_fields(
         [
@@ -109,7 +109,7 @@ def _print(info: dict[str, Any]) -> None:
             ),
             ("Eq. 1", f"D_thresh {d_thresh:.3g} m, lambda {lambda_rot:.3g} m/rad"),
             ("features", kinds),
-            ("look-alike floors", f"{floors} (topoloc update --look-alike-floors changes it)"),
+            ("floors", f"{floors} (topoloc update --look-alike-floors changes it)"),
             ("certificate", _describe_certificate(info["certificate"])),
             *([("check", info["check"])] if "check" in info else []),
         ]
