@@ -166,7 +166,9 @@ def test_the_setting_is_an_option_of_build_is_shown_and_changed_later(
     shown = list[bool]()
     for path, change in ((strict, None), (plain, None), (plain, "yes"), (plain, "no")):
         if change is not None:
+            capsys.readouterr()
             assert main(["update", path, "--look-alike-floors", change]) == 0
+            assert "look alike" in capsys.readouterr().out
         capsys.readouterr()
         assert main(["info", path]) == 0
         (line,) = (one for one in capsys.readouterr().out.splitlines() if "look-alike" in one)

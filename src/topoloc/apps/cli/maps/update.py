@@ -72,18 +72,20 @@ class Command:
     """TOML file with all other settings, as printed by `topoloc config update`."""
 
     def run(self) -> int:
-        if self.look_alike_floors is not None and len(self.paths) == 1:
+        if self.look_alike_floors is not None:
+            if len(self.paths) != 1:
+                raise UsageError("--look-alike-floors takes one map or atlas, without recordings")
             place, value = open_place(self.paths[0]), self.look_alike_floors == "yes"
 
             def change(path: Path) -> dict[str, Any]:
                 TopoMetricMap.set_look_alike_floors(path, value, print_waiting)
+                if self.json != "-":
+                    print_line(f"{path.name}: floors {'' if value else 'do not '}look alike")
                 return {"look_alike_floors": value}
 
             return run_for_each_tile(
-                place, self.tile, lambda tile_id: place.edit(tile_id, change), self.json
+                place, self.tile, lambda one: place.edit(one, change), self.json
             )
-        if self.look_alike_floors is not None:
-            raise UsageError("--look-alike-floors takes one map or atlas, without recordings")
         if len(self.paths) < 2:
             raise UsageError("update takes a map or an atlas, and at least one recording")
         if self.joined and len(self.paths) > 2:
