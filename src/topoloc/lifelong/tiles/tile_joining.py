@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.atlas.atlas import Atlas, absolute_address
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins
 from topoloc.atlas.joins import Join
 from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
@@ -177,8 +177,7 @@ def join_tiles(
         selected = [(atlas.tile(a), atlas.tile(b)) for a, b in ordered if (a, b) not in known]
     pair_results = list[PairResult]()
     if run_jobs is not None:
-        address = absolute_address(where)
-        jobs = [PairJob(address, first.tile_id, second.tile_id) for first, second in selected]
+        jobs = [PairJob(atlas.address, first.tile_id, second.tile_id) for first, second in selected]
         pair_results = run_jobs(jobs) if jobs else []
     else:
         with closing(MapCache([], Localizer, _MAX_BYTES)) as maps:

@@ -4,7 +4,7 @@ nodes."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar, no_type_check
 
@@ -186,3 +186,30 @@ class CorrelatedErrors:
 
     rho: float
     digest: str
+
+
+@dataclass(frozen=True)
+class NextIds:
+    """Hold the ids of the next new entries. They are larger than any id ever used in the map."""
+
+    session: int = 0
+    node: int = 0
+    place_image: int = 1
+    side_node: int = 0
+    edit: int = 1
+
+
+@no_type_check  # as for virtual nodes
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Hold the part of a map that belongs to one feature type.
+
+    - `nodes[i]` is the node of row i with its points of this type.
+    - `coarse_models` holds coarse localizers by name. Those that need no local features stand in
+      the first layer only.
+    - `shared_errors` is None if not measured.
+    """
+
+    nodes: Sequence[TopoNode]
+    coarse_models: Mapping[str, CoarseModel] = field(default_factory=dict)
+    shared_errors: CorrelatedErrors | None = None
