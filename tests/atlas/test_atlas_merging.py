@@ -13,7 +13,7 @@ import pytest
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins, create_atlas, new_tiles
-from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import Join
 from topoloc.errors import AtlasError
 from topoloc.geometry.rigid import Rigid3
 

@@ -17,7 +17,7 @@ from tiny_world import write_stereo_recording
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, add_tiles, create_atlas, new_tiles
-from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import Tile
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3

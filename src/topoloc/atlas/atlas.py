@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
-from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
 from topoloc.atlas.store import MANIFEST, Store, find_store, read_manifest, sha256_of, store_at
 from topoloc.atlas.tile_facts import find_other_facts

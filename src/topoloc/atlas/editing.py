@@ -17,7 +17,7 @@ from pathlib import Path
 from msgspec import structs
 
 from topoloc.atlas.index import compute_global_descriptors, save_global_descriptors
-from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile, check_tile_id
 from topoloc.atlas.store import Store, read_manifest, sha256_of, store_at
 from topoloc.atlas.tile_facts import map_facts

@@ -7,17 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import compute_variance_inflation
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
     WeighedCamera,
     map_variance,
 )
+from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
 from topoloc.geometry.rolling_shutter import TurningCamera, find_rotation
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin
 from topoloc.localization.evidence import (
     compute_normalized_uncertainty,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
-from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.storage.entries import Edit, today
 from topoloc.mapping.storage.kept_files import (
     drop_kept_files,
     find_fault,

@@ -26,14 +26,15 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.certificate import Certificate
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
-from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.storage.entries import (
     Edge,
+    Edit,
     Layer,
     NextIds,
     NodeSummary,
     PlaceImage,
     Repetitions,
+    Session,
     TopoNode,
     VirtualNodes,
 )

@@ -18,8 +18,7 @@ import numpy as np
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins
-from topoloc.atlas.joins import Join
-from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
+from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M, Join
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError, MapError, TrajectoryError

@@ -19,16 +19,17 @@ from topoloc.json_data import Finite, decode_json
 from topoloc.mapping.certificate import Certificate
 from topoloc.mapping.config import CONFIG_VERSION, config_from_text
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
-from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.storage.entries import (
     CorrelatedErrors,
     Edge,
+    Edit,
     Layer,
     LazyMapping,
     NextIds,
     NodeSummary,
     PlaceImage,
     Repetitions,
+    Session,
     TopoNode,
     VirtualNodes,
 )

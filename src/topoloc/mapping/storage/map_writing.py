@@ -24,8 +24,7 @@ from topoloc.errors import MapError
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import encode_statistics
-from topoloc.mapping.sessions import Session
-from topoloc.mapping.storage.entries import TopoNode
+from topoloc.mapping.storage.entries import Session, TopoNode
 from topoloc.mapping.storage.kept_files import drop_kept_files, keep_file
 from topoloc.mapping.storage.map_lock import WaitCallback, no_edit_of
 from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
