@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import (
     FeatureConfig,
     PatchNormalizationConfig,
@@ -24,6 +23,7 @@ from topoloc.features.extraction import (
     normalize_image,
     patch_normalize,
 )
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import match_features, match_pooled
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.open import open_sequence

@@ -22,14 +22,13 @@ import cv2
 import numpy as np
 import tyro
 
-from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import (
     FeatureConfig,
     PatchNormalizationConfig,
     extract_features,
     patch_normalize,
 )
-from topoloc.features.features import Features
+from topoloc.features.features import Features, MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.features.surf import extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose

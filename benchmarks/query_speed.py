@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import FeatureConfig
+from topoloc.features.features import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig

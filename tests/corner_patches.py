@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from topoloc.features.feature_types import FeatureConfig, FeatureType, GuidedThresholds
-from topoloc.features.features import Features
+from topoloc.features.features import FeatureConfig, Features, FeatureType, GuidedThresholds
 
 _PATCH_PX, _CELLS = 24, 8
 

@@ -21,7 +21,7 @@ import pytest
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.apps.formats.bags.chunked_file import WHOLE_FILE, ChunkedBytes
-from topoloc.recordings import atomic, file_locks
+from topoloc.recordings import atomic
 
 ROOT = Path(__file__).parents[1]
 _DESCRIPTORS = Path("/proc/self/fd")
@@ -82,7 +82,7 @@ def windows() -> Iterator[None]:
         monkeypatch.setattr(os, "open", open_file)
         monkeypatch.setattr(os, "fsync", fsync)
         monkeypatch.setattr(shutil, "_use_fd_functions", False)
-        monkeypatch.setattr(file_locks, "fcntl", None)
+        monkeypatch.setattr(atomic, "fcntl", None)
         for name in ("pread", "sched_getaffinity"):
             monkeypatch.delattr(os, name)
         monkeypatch.setitem(sys.modules, "resource", None)

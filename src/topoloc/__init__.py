@@ -99,11 +99,7 @@ if TYPE_CHECKING:
     )
     from topoloc.localization.search import Trace as Trace, TriedProposal as TriedProposal
     from topoloc.mapping.build import BuildConfig as BuildConfig
-    from topoloc.mapping.edit import (
-        read_history as read_history,
-        set_look_alike_floors as set_look_alike_floors,
-        undo_edit as undo_edit,
-    )
+    from topoloc.mapping.edit import read_history as read_history, undo_edit as undo_edit
     from topoloc.mapping.georeference import (
         GeoreferenceResult as GeoreferenceResult,
         georeference as georeference,
@@ -178,7 +174,7 @@ _NAMES = {
     "topoloc.localization.search": "Trace TriedProposal",
     "topoloc.tracking.shared_cameras": "SharedCameras",
     "topoloc.mapping.build": "BuildConfig",
-    "topoloc.mapping.edit": "read_history set_look_alike_floors undo_edit",
+    "topoloc.mapping.edit": "read_history undo_edit",
     "topoloc.mapping.georeference": "GeoreferenceResult georeference",
     "topoloc.mapping.storage.entries": "Illumination TopoNode",
     "topoloc.mapping.topomap": "TopoMetricMap",

@@ -5,7 +5,6 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import (
     NORMALIZATIONS,
     FeatureConfig,
@@ -13,6 +12,7 @@ from topoloc.features.extraction import (
     extract_from_normalized,
     normalize_image,
 )
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import match_features
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from topoloc.features.config import MatchingConfig
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import Matcher, find_similar_pairs, match_features, match_pooled
 from topoloc.features.matching_kernels import TILE
 

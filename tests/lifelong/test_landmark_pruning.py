@@ -14,7 +14,7 @@ from tiny_world import CAMERA
 from topoloc import Localizer, TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
-from topoloc.lifelong.landmark_pruning import quantize_node_descriptors
+from topoloc.lifelong.node_pruning import quantize_node_descriptors
 from topoloc.localization.result import Localization
 from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.storage.point_encoding import compress_array

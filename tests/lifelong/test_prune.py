@@ -20,7 +20,7 @@ from topoloc import Localizer, TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.errors import MapError
 from topoloc.geometry.alignment import translation_error
-from topoloc.lifelong.landmark_pruning import select_landmarks
+from topoloc.lifelong.node_pruning import select_landmarks
 from topoloc.lifelong.prune import _FileSize
 from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map

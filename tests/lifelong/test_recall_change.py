@@ -13,8 +13,8 @@ import pytest
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.apps.cli.maps.history import _format_changes
-from topoloc.lifelong.landmark_pruning import select_landmarks
 from topoloc.lifelong.node_localization import measure_recall_change
+from topoloc.lifelong.node_pruning import select_landmarks
 
 
 def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room_map: Path):

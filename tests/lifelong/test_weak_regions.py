@@ -17,8 +17,8 @@ from tiny_world import write_stereo_recording
 from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.apps.cli import main
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.landmark_pruning import select_landmarks
 from topoloc.lifelong.node_localization import sample_evenly
+from topoloc.lifelong.node_pruning import select_landmarks
 from topoloc.lifelong.weak_regions import find_weak_regions
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage

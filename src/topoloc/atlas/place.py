@@ -4,7 +4,7 @@ an atlas by common world."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +15,7 @@ from topoloc.errors import AtlasError, MapError, ObjectStoreError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
-from topoloc.mapping.edit import read_history
+from topoloc.mapping.edit import WaitCallback, edit_map, read_history
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -131,6 +131,20 @@ class SingleMap:
     def edit(self, tile_id: str, edit: Callable[[Path], T]) -> T:
         """Return the result of `edit`, called with the path of the file. Raises as `edit`."""
         return edit(Path(self.where))
+
+    def set_look_alike_floors(self, value: bool, on_wait: WaitCallback | None = None) -> None:
+        """Change `MapConfig.look_alike_floors` of the map, as one edit. Raises MapError: all images
+        are grey, or the map cannot be read or written."""
+        with edit_map(self.where, on_wait) as edit:
+            lights = [session.light for session in edit.topomap.sessions]
+            if value and lights and all(one and one.red == one.blue == 1.0 for one in lights):
+                raise MapError(
+                    f"map {self.where} has no colours to tell floors apart: all its images are"
+                    f" grey; `topoloc update {self.where} SEQ` adds a recording in colour"
+                )
+            config = replace(edit.topomap.config, look_alike_floors=value)
+            name = f"look-alike floors: {'yes' if value else 'no'}"
+            edit.commit(replace(edit.topomap, config=config), name)
 
     def report(self, facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
         """Return the facts of the map as one JSON object."""

@@ -19,8 +19,14 @@ from typing import Protocol, runtime_checkable
 
 from topoloc.atlas.manifest import TILES, Manifest
 from topoloc.errors import AtlasError, TopolocError
-from topoloc.recordings.atomic import atomic_write, remove_all_stale_files, write_bytes
-from topoloc.recordings.file_locks import close, open_to_lock, wait_for_lock
+from topoloc.recordings.atomic import (
+    atomic_write,
+    close,
+    open_to_lock,
+    remove_all_stale_files,
+    wait_for_lock,
+    write_bytes,
+)
 
 MANIFEST = "atlas.json"
 _LOCK = ".atlas.lock"

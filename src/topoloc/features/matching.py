@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
-from topoloc.features.config import MatchingConfig
-from topoloc.features.features import Matches
+from topoloc.features.features import Matches, MatchingConfig
 from topoloc.features.matching_kernels import (
     GROUP,
     ROWS,

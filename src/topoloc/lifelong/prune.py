@@ -1,10 +1,9 @@
 """Make a map smaller. Start reading at `prune`.
 
 Vanished landmarks are removed first. A landmark has vanished if many images that show its
-neighbours again never show it. Descriptors are then quantized on request
-(`landmark_pruning.py`). With a size budget, nodes supported by others are removed if every
-node would otherwise keep few landmarks (`node_pruning.py`). Each remaining node then keeps as many
-landmarks as fit.
+neighbours again never show it. Descriptors are then quantized on request. With a
+size budget, nodes supported by others are removed if every node would otherwise keep few landmarks.
+Each remaining node then keeps as many landmarks as fit (`node_pruning.py`).
 """
 
 from __future__ import annotations
@@ -20,15 +19,17 @@ from typing import Any, Literal
 import numpy as np
 
 from topoloc.errors import MapError
-from topoloc.lifelong.landmark_pruning import (
+from topoloc.lifelong.node_localization import measure_recall_change
+from topoloc.lifelong.node_pruning import (
     choose_landmarks,
+    compute_node_support,
     find_vanished,
     quantize_node_descriptors,
+    remove_nodes,
     select_landmarks,
+    select_removed_nodes,
     transform_nodes,
 )
-from topoloc.lifelong.node_localization import measure_recall_change
-from topoloc.lifelong.node_pruning import compute_node_support, remove_nodes, select_removed_nodes
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.landmark_statistics import merge_count_statistics

@@ -17,19 +17,19 @@ from typing import Any
 from topoloc.errors import MapError
 from topoloc.mapping.storage.entries import Edit, today
 from topoloc.mapping.storage.kept_files import (
+    WaitCallback,
     drop_kept_files,
     find_fault,
     find_kept_files,
     keep_file,
+    lock_map_file,
     warn_of_damage,
 )
-from topoloc.mapping.storage.map_lock import WaitCallback, lock_map_file
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.validation import describe_failure
-from topoloc.recordings.atomic import atomic_write
-from topoloc.recordings.file_locks import fsync, replace as replace_file
+from topoloc.recordings.atomic import atomic_write, fsync, replace as replace_file
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
@@ -144,23 +144,6 @@ def read_history(path: str | Path, num_undoable: int | None = None) -> list[dict
         edit | {"undoable": number > len(edits) - num_undoable}
         for number, edit in enumerate(edits, start=1)
     ]
-
-
-def set_look_alike_floors(
-    path: str | Path, value: bool, on_wait: WaitCallback | None = None
-) -> None:
-    """Change `MapConfig.look_alike_floors` of a map file, as one edit. Raises MapError: all images
-    are grey, or the map cannot be read or written."""
-    with edit_map(path, on_wait) as edit:
-        lights = [session.light for session in edit.topomap.sessions]
-        if value and lights and all(one and one.red == one.blue == 1.0 for one in lights):
-            raise MapError(
-                f"map {path} has no colours to tell floors apart: all its images are grey;"
-                f" `topoloc update {path} SEQ` adds a recording in colour"
-            )
-        config = replace(edit.topomap.config, look_alike_floors=value)
-        name = f"look-alike floors: {'yes' if value else 'no'}"
-        edit.commit(replace(edit.topomap, config=config), name)
 
 
 def _explain_missing(path: Path, last: Edit | None) -> str:

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from topoloc.compiled import kernel
-from topoloc.features.config import MatchingConfig
-from topoloc.features.features import Features
+from topoloc.features.features import Features, MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.features.config import MatchingConfig
-from topoloc.features.features import Features
+from topoloc.features.features import Features, MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import points_from_depth

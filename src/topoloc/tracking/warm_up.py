@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from topoloc.compiled import is_cached
-from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import largest_similarities, match_features
 from topoloc.features.surf_detector_kernels import integral_image
 from topoloc.geometry.camera import Camera

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.features.config import MatchingConfig
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error

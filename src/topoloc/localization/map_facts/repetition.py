@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.features.config import MatchingConfig
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import find_similar_pairs, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topoloc.features.config import MatchingConfig
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.camera import UncalibratedCamera

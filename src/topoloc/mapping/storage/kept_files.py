@@ -1,4 +1,5 @@
-"""Keep the files that edits of a map replaced, so that the edits can be undone.
+"""Lock a map file, so that one process at a time replaces it. Keep the files that edits of a map
+replaced, so that the edits can be undone. The lock ends with the process.
 
 `lab.topo.undo-AFTER-BEFORE` is the file that an edit replaced: a hard link, or a copy where links
 do not work. AFTER and BEFORE are digests of the map file after and before this edit. So the names
@@ -11,17 +12,64 @@ import hashlib
 import os
 import re
 import shutil
+import threading
 import warnings
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import accumulate
 from pathlib import Path
 from typing import TypeVar
 
 from topoloc.errors import MapError
 from topoloc.mapping.validation import describe_failure
-from topoloc.recordings.atomic import atomic_write, short_name
-from topoloc.recordings.file_locks import fsync, has_locks
+from topoloc.recordings.atomic import (
+    atomic_write,
+    close,
+    fsync,
+    has_locks,
+    open_to_lock,
+    short_name,
+    wait_for_lock,
+)
+
+WaitCallback = Callable[[], None]
+"""Called before waiting for another process that edits the map."""
+_owners = dict[tuple[int, int], int]()
+"""The thread that holds the lock of a file, by device and inode."""
+
+
+@contextmanager
+def lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[os.stat_result]:
+    """Lock the file at `path` and yield its status. Repeats if the previous owner of the lock
+    replaced the file. Raises OSError if it cannot be opened, MapError if this thread edits it."""
+    while True:
+        descriptor, locked = open_to_lock(path)
+        try:
+            key = locked.st_dev, locked.st_ino
+            if _owners.get(key) == threading.get_ident():
+                raise MapError(f"map {path} is being edited by this thread: commit that edit first")
+            wait_for_lock(descriptor, on_wait)
+            if path.exists() and os.path.samestat(locked, path.stat()):
+                _owners[key] = threading.get_ident()
+                try:
+                    yield locked
+                finally:
+                    del _owners[key]
+                return
+        finally:
+            close(descriptor)
+
+
+@contextmanager
+def no_edit_of(path: Path, on_wait: WaitCallback | None) -> Iterator[None]:
+    """Wait until no other edits the map at `path`, and keep others from it meanwhile. A missing or
+    unreadable file is not locked. Raises MapError if this thread edits the map."""
+    with ExitStack() as stack:
+        if os.path.isfile(path):
+            with suppress(OSError):
+                stack.enter_context(lock_map_file(path, on_wait))
+        yield
+
 
 T = TypeVar("T")
 _MAX_BYTES = 1_000_000_000

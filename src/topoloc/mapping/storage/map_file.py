@@ -39,7 +39,7 @@ from topoloc.mapping.validation import (
     describe_failure,
     sqlite_failures_as_os_errors,
 )
-from topoloc.recordings.file_locks import has_locks
+from topoloc.recordings.atomic import has_locks
 
 MAX_STEPS = 50_000_000
 """Limit of SQLite's steps in one read. A table of MAX_ROWS rows takes a quarter of them."""

@@ -25,8 +25,7 @@ from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import encode_statistics
 from topoloc.mapping.storage.entries import Session, TopoNode
-from topoloc.mapping.storage.kept_files import drop_kept_files, keep_file
-from topoloc.mapping.storage.map_lock import WaitCallback, no_edit_of
+from topoloc.mapping.storage.kept_files import WaitCallback, drop_kept_files, keep_file, no_edit_of
 from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
 from topoloc.mapping.storage.schema import (
     APPLICATION_ID,

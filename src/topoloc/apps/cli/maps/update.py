@@ -12,9 +12,9 @@ from topoloc import (
     Atlas,
     AtlasConfig,
     LocalizerConfig,
+    SingleMap,
     Trajectory,
     open_place,
-    set_look_alike_floors,
 )
 from topoloc.apps.cli.mapping.recordings_table import report_outcomes
 from topoloc.apps.cli.maps.session_update import AtlasUpdate, SessionUpdateOptions, describe_update
@@ -85,7 +85,7 @@ class Command:
             place, value = open_place(self.paths[0]), self.look_alike_floors == "yes"
 
             def change(path: Path) -> dict[str, Any]:
-                set_look_alike_floors(path, value, print_waiting)
+                SingleMap(str(path)).set_look_alike_floors(value, print_waiting)
                 if self.json != "-":
                     print_line(f"{path.name}: floors {'' if value else 'do not '}look alike")
                 return {"look_alike_floors": value}
