@@ -33,7 +33,7 @@ import tyro
 from jaxtyping import Float32
 
 from topoloc import Localizer, TopoMetricMap, open_sequence
-from topoloc.features.features import find_feature_type
+from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.lifelong.prune import _drop_landmarks
 from topoloc.localization.result import Localization

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from topoloc.features.features import default_learned_type
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig

@@ -25,7 +25,8 @@ import numpy as np
 import tyro
 
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, Features
+from topoloc.features.feature_types import FeatureConfig
+from topoloc.features.features import Features
 from topoloc.mapping.config import MapConfig
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import read_image

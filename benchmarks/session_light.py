@@ -24,7 +24,8 @@ import numpy as np
 import tyro
 
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, Features
+from topoloc.features.feature_types import FeatureConfig
+from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.coarse_models import (
     compute_illumination_distance,

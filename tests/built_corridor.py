@@ -15,7 +15,7 @@ import numpy as np
 
 from made_once import once_a_run
 from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
-from topoloc.features.features import default_learned_type
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from topoloc.features.features import FeatureConfig, Features, FeatureType, GuidedThresholds
+from topoloc.features.feature_types import FeatureConfig, FeatureType, GuidedThresholds
+from topoloc.features.features import Features
 
 _PATCH_PX, _CELLS = 24, 8
 

@@ -19,7 +19,7 @@ import pytest
 
 import topoloc
 from topoloc.demo.recordings import SHIPPED
-from topoloc.features import features
+from topoloc.features import feature_types
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.trajectory import Trajectory
@@ -163,7 +163,7 @@ def test_inspect_map(run: Run, lab: Path, tmp_path: Path):
 
 def test_own_features(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A map of ORB opens where ORB is registered, and is refused with the remedy elsewhere."""
-    monkeypatch.setattr(features, "FEATURE_TYPES", dict(features.FEATURE_TYPES))
+    monkeypatch.setattr(feature_types, "FEATURE_TYPES", dict(feature_types.FEATURE_TYPES))
     printed = run("own_features")
     assert "8 of 8 localized" in printed
     assert max(_centimetres(printed, "median error")) < 0.5
@@ -171,9 +171,9 @@ def test_own_features(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     _refuses_in_a_new_process(
         tmp_path / "lab_orb.topo", "lab_orb.topo: no features of kind 'orb'", "feature_type"
     )
-    surf = features.FEATURE_TYPES["surf"]
+    surf = feature_types.FEATURE_TYPES["surf"]
     with pytest.raises(topoloc.FeatureTypeError, match="'surf' are topoloc's"):
-        features.register_feature_type(surf)
+        feature_types.register_feature_type(surf)
 
 
 def test_own_retrieval(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from topoloc.compiled import kernel_caches as kernel_caches
     from topoloc.evaluation.metrics import format_length as format_length
     from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
-    from topoloc.features.features import (
+    from topoloc.features.feature_types import (
         FeatureConfig as FeatureConfig,
-        Features as Features,
         FeatureType as FeatureType,
         GuidedThresholds as GuidedThresholds,
         find_available_types as find_available_types,
         register_feature_type as register_feature_type,
     )
+    from topoloc.features.features import Features as Features
     from topoloc.features.network_files import (
         NetworkInfo as NetworkInfo,
         cache_folder as cache_folder,
@@ -109,10 +109,10 @@ _NAMES = {
     "topoloc.compiled": "kernel_caches",
     "topoloc.evaluation.metrics": "format_length",
     "topoloc.evaluation.node_matching": "NodeMatcher",
-    "topoloc.features.features": (
-        "FeatureConfig FeatureType Features GuidedThresholds find_available_types"
-        " register_feature_type"
+    "topoloc.features.feature_types": (
+        "FeatureConfig FeatureType GuidedThresholds find_available_types register_feature_type"
     ),
+    "topoloc.features.features": "Features",
     "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.localization.query": "Deadline",

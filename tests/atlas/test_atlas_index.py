@@ -87,7 +87,7 @@ def test_pictures_look_like_their_own_tile(atlas: Path):
     from built_room import unseen_views
     from tiny_world import CAMERA
     from topoloc.features.extraction import extract_features
-    from topoloc.features.features import FeatureConfig
+    from topoloc.features.feature_types import FeatureConfig
     from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
     index, vocabulary = Atlas.open(str(atlas)).index, shared_vocabulary("surf")

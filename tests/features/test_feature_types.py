@@ -7,7 +7,7 @@ import pytest
 
 from tiny_network import write_network
 from topoloc.errors import FeatureTypeError
-from topoloc.features.features import (
+from topoloc.features.feature_types import (
     FEATURE_TYPES,
     FeatureConfig,
     FeatureType,

@@ -10,7 +10,7 @@ import pytest
 from tiny_network import STRIDE, cells, write_network
 from topoloc.errors import WeightsError
 from topoloc.features import learned
-from topoloc.features.features import check_available, default_learned_type
+from topoloc.features.feature_types import check_available, default_learned_type
 from topoloc.features.learned import (
     SingleLevelDescriptors,
     extract_learned,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tiny_world import CAMERA
-from topoloc.features.features import SURF, FeatureConfig, Features, Matches
+from topoloc.features.feature_types import SURF, FeatureConfig
+from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis

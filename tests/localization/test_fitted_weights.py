@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from topoloc.errors import FeatureTypeError
-from topoloc.features.features import find_feature_type
+from topoloc.features.feature_types import find_feature_type
 from topoloc.localization.fitted_weights import WEIGHTS_FOLDER, load_fitted_weights, read_weights
 
 

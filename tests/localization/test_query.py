@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from topoloc.errors import QueryError
-from topoloc.features.features import FeatureConfig
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.localization.query import Deadline, Query, check_image_size, reduce_image
 

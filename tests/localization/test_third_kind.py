@@ -14,7 +14,7 @@ from built_room import unseen_views
 from corner_patches import CORNER_PATCHES
 from tiny_world import CAMERA
 from topoloc.errors import FeatureTypeError, MapError
-from topoloc.features.features import FEATURE_TYPES, FeatureConfig
+from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig

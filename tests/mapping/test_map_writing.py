@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from topoloc.errors import MapError, MapVersionError
-from topoloc.features.features import FEATURE_TYPES, SURF
+from topoloc.features.feature_types import FEATURE_TYPES, SURF
 from topoloc.mapping.storage import map_writing
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap

@@ -13,7 +13,7 @@ import pytest
 from built_room import room_of_two_kinds, unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import FeatureTypeError, WeightsError
-from topoloc.features.features import default_learned_type
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.features.features import default_learned_type
+from topoloc.features.feature_types import default_learned_type
 from topoloc.mapping.topomap import TopoMetricMap
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from built_room import built_room
 from topoloc.demo.recordings import SHIPPED
-from topoloc.features.features import default_learned_type
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map

@@ -11,7 +11,8 @@ import pytest
 
 from topoloc.errors import MapError
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, Features
+from topoloc.features.feature_types import FeatureConfig
+from topoloc.features.features import Features
 from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.config import MapConfig
 from topoloc.recordings.frame import to_grey

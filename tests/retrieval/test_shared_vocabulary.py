@@ -7,7 +7,8 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from topoloc.features.features import FEATURE_TYPES, Features
+from topoloc.features.feature_types import FEATURE_TYPES
+from topoloc.features.features import Features
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, Features, MatchingConfig, find_feature_type
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
+from topoloc.features.features import Features, MatchingConfig
 from topoloc.features.matching import Matches, match_pooled
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3

@@ -14,7 +14,8 @@ from jaxtyping import UInt8
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.compiled import kernel
-from topoloc.features.features import FeatureConfig, Features, find_feature_type
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
+from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_for_rows
 
 

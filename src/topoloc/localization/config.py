@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal
 
 from topoloc.bounds import AtLeast, Between
-from topoloc.features.features import FeatureType, MatchingConfig
+from topoloc.features.feature_types import FeatureType
+from topoloc.features.features import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.json_data import OneLine
 from topoloc.localization.guided import GuidedConfig

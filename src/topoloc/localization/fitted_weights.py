@@ -21,7 +21,7 @@ from msgspec import Struct, to_builtins
 from msgspec.structs import astuple
 
 from topoloc.errors import FeatureTypeError
-from topoloc.features.features import FEATURE_TYPES, LEARNED_TYPES
+from topoloc.features.feature_types import FEATURE_TYPES, LEARNED_TYPES
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.belief import RivalWeights
 from topoloc.localization.provenance import Evidence, log_doubt, log_even_share

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from topoloc.bounds import Between
-from topoloc.features.features import Features, FeatureType, GuidedThresholds, Matches
+from topoloc.features.feature_types import FeatureType, GuidedThresholds
+from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided_kernels import (

@@ -9,7 +9,7 @@ from functools import cached_property
 from msgspec import structs
 
 from topoloc.errors import WeightsError
-from topoloc.features.features import check_available, select_stored_types
+from topoloc.features.feature_types import check_available, select_stored_types
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from topoloc.errors import EmptyMapError
-from topoloc.features.features import Features, find_feature_type
+from topoloc.features.feature_types import find_feature_type
+from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact.patch_alignment import NodeTemplate

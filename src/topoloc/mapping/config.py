@@ -7,7 +7,7 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 
 from topoloc.bounds import AtLeast, parse_settings
 from topoloc.errors import ConfigError
-from topoloc.features.features import (
+from topoloc.features.feature_types import (
     SURF,
     FeatureConfig,
     check_available,

@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, MatchingConfig, find_feature_type
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.pose_conventions import UNITS

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, Features, MatchingConfig
+from topoloc.features.feature_types import FeatureConfig
+from topoloc.features.features import Features, MatchingConfig
 from topoloc.features.matching import find_similar_pairs, match_features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import estimate_absolute_pose

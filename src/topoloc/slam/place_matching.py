@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, MatchingConfig, find_feature_type
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
+from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3

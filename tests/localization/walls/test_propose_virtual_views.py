@@ -27,14 +27,14 @@ from built_corridor import (
 )
 from tiny_world import path_pose, render, room
 from topoloc.errors import MapError
-from topoloc.features.features import (
+from topoloc.features.feature_types import (
     FEATURE_TYPES,
     SURF,
     FeatureConfig,
-    Features,
     default_learned_type,
     find_feature_type,
 )
+from topoloc.features.features import Features
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3

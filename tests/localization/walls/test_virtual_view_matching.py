@@ -9,7 +9,8 @@ import pytest
 
 from built_corridor import WIDE, back, built_corridor, seen_on_the_way_back
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import SURF, FeatureConfig, Features
+from topoloc.features.feature_types import SURF, FeatureConfig
+from topoloc.features.features import Features
 from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.alignment import rotation_error, translation_error

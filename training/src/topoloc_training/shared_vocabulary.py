@@ -20,7 +20,8 @@ from jaxtyping import Float32
 
 import topoloc
 from topoloc.features.extraction import extract_features
-from topoloc.features.features import FeatureConfig, Features, find_feature_type
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
+from topoloc.features.features import Features
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import as_monocular

@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from topoloc.errors import TopolocError
-from topoloc.features.features import find_feature_type
+from topoloc.features.feature_types import find_feature_type
 from topoloc.localization.fitted_weights import (
     FALLBACK_TYPE,
     FittedWeights,

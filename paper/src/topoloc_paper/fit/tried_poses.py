@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.features.features import FeatureConfig
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.config import EvidenceConfig

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
-from topoloc.features.features import find_feature_type
+from topoloc.features.feature_types import find_feature_type
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import select_hypothesis

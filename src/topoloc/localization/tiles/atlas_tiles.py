@@ -20,7 +20,7 @@ from topoloc.atlas.manifest import Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.tile_fetcher import RETRY_AFTER_S
 from topoloc.errors import AtlasError, MapError
-from topoloc.features.features import FEATURE_TYPES, FeatureConfig, find_available_types
+from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig, find_available_types
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from topoloc.features.extraction import extract_from_normalized, normalize_image
-from topoloc.features.features import FeatureConfig, Features, Matches
+from topoloc.features.feature_types import FeatureConfig
+from topoloc.features.features import Features, Matches
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3

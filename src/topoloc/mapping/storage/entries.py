@@ -13,7 +13,8 @@ from typing import Any, TypeVar, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int8, UInt8
 
-from topoloc.features.features import Features, find_feature_type
+from topoloc.features.feature_types import find_feature_type
+from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine

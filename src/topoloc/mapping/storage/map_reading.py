@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from topoloc.bounds import parse_settings
-from topoloc.features.features import find_feature_type
+from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.json_data import Finite, decode_json

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int8
 
-from topoloc.features.features import Features, find_feature_type
+from topoloc.features.feature_types import find_feature_type
+from topoloc.features.features import Features
 from topoloc.json_data import decode_json
 from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.storage.schema import split_layer_name
