@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from topoloc.errors import MapError
-from topoloc.features.virtual_views import make_virtual_views
+from topoloc.features.extraction import make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.config import VirtualViewSearchConfig

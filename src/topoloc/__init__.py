@@ -66,8 +66,7 @@ if TYPE_CHECKING:
     from topoloc.geometry.rig import StereoRig as StereoRig
     from topoloc.geometry.rigid import Rigid3 as Rigid3
     from topoloc.lifelong.growing import GrowingMap as GrowingMap, Growth as Growth
-    from topoloc.lifelong.merge import merge as merge
-    from topoloc.lifelong.move import move_map as move_map
+    from topoloc.lifelong.merge import merge as merge, move_map as move_map
     from topoloc.lifelong.prune import prune as prune
     from topoloc.lifelong.tiles.tile_joining import (
         PairResult as PairResult,
@@ -159,8 +158,7 @@ _NAMES = {
     "topoloc.geometry.rig": "StereoRig",
     "topoloc.geometry.rigid": "Rigid3",
     "topoloc.lifelong.growing": "GrowingMap Growth",
-    "topoloc.lifelong.move": "move_map",
-    "topoloc.lifelong.merge": "merge",
+    "topoloc.lifelong.merge": "merge move_map",
     "topoloc.lifelong.prune": "prune",
     "topoloc.lifelong.tiles.tile_joining": "PairResult find_tile_of_recording join_tiles",
     "topoloc.lifelong.update": "MapUpdate update",

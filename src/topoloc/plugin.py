@@ -55,10 +55,6 @@ if TYPE_CHECKING:
         CameraCalibration as CameraCalibration,
         read_camera_json as read_camera_json,
     )
-    from topoloc.recordings.depth_images import (
-        depth_image_of as depth_image_of,
-        read_depth_image as read_depth_image,
-    )
     from topoloc.recordings.format import (
         RecordingFormat as RecordingFormat,
         list_images as list_images,
@@ -72,9 +68,11 @@ if TYPE_CHECKING:
     from topoloc.recordings.image_io import (
         MAX_PIXELS as MAX_PIXELS,
         EncodedImage as EncodedImage,
+        depth_image_of as depth_image_of,
         exif_focal_length as exif_focal_length,
         find_white_level as find_white_level,
         image_size as image_size,
+        read_depth_image as read_depth_image,
     )
     from topoloc.recordings.open import (
         find_format as find_format,
@@ -122,14 +120,14 @@ _NAMES = {
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_files": "CameraCalibration read_camera_json",
-    "topoloc.recordings.depth_images": "read_depth_image depth_image_of",
     "topoloc.recordings.format": (
         "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"
     ),
     "topoloc.recordings.formats.video": "Video silence_opencv",
     "topoloc.recordings.frame": "IndexedFrames",
     "topoloc.recordings.image_io": (
-        "EncodedImage MAX_PIXELS exif_focal_length find_white_level image_size"
+        "EncodedImage MAX_PIXELS depth_image_of exif_focal_length find_white_level image_size"
+        " read_depth_image"
     ),
     "topoloc.recordings.open": "find_format split_selection",
     "topoloc.recordings.recording": "DepthImages Recording as_monocular has_scale scale_poses",

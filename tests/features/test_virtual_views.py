@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tiny_world import LEVEL_FROM_CAM, Panel, render
+from topoloc.features.extraction import VirtualView, make_virtual_views
 from topoloc.features.features import Features
-from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 

@@ -17,8 +17,7 @@ from hypothesis import given, settings, strategies as st
 from built_corridor import WalkAhead, built_corridor, corridor
 from tiny_world import render
 from topoloc.errors import MapError
-from topoloc.features.extraction import FeatureConfig
-from topoloc.features.virtual_views import make_virtual_views
+from topoloc.features.extraction import FeatureConfig, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.build import BuildConfig, build_map

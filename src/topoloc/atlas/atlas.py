@@ -11,12 +11,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
+from topoloc.atlas.editing import find_other_facts
 from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
 from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
 from topoloc.atlas.store import MANIFEST, Store, find_store, read_manifest, sha256_of, store_at
-from topoloc.atlas.tile_facts import find_other_facts
 from topoloc.errors import AtlasError, MapError, TopolocError
 from topoloc.json_data import OneLine
 from topoloc.mapping.edit import read_history

@@ -13,14 +13,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from msgspec import structs
 
 from topoloc.atlas.index import compute_global_descriptors, save_global_descriptors
-from topoloc.atlas.joint_worlds import Join
+from topoloc.atlas.joint_worlds import Join, geo_box
 from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile, check_tile_id
 from topoloc.atlas.store import Store, read_manifest, sha256_of, store_at
-from topoloc.atlas.tile_facts import map_facts
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.mapping.storage.kept_files import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
@@ -315,4 +316,36 @@ def with_unique_worlds(known: Mapping[str, Tile], added: Mapping[str, Tile]) -> 
         names[world] = name
     return {
         tile_id: structs.replace(tile, world=names[tile.world]) for tile_id, tile in added.items()
+    }
+
+
+def find_other_facts(tile: Tile, path: Path) -> list[str]:
+    """Return the names of those facts of a tile that its map at `path` contradicts. Raises
+    MapError."""
+    with TopoMetricMap.load(path) as topomap:
+        facts = map_facts(topomap)
+    if facts["georeference"] is None:
+        facts["geo_box"] = tile.geo_box  # it may follow from other tiles
+    entry, expected = tile.to_json(), structs.replace(tile, **facts).to_json()
+    boxes = [np.array(one.pop("geo_box") or [], np.float64) for one in (entry, expected)]
+    # the last digits of trigonometric functions depend on the machine
+    is_same_box = boxes[0].shape == boxes[1].shape and np.allclose(*boxes, rtol=0.0, atol=1e-9)
+    other = [key for key in expected if entry[key] != expected[key]]
+    return other if is_same_box else [*other, "geo_box"]
+
+
+def map_facts(topomap: TopoMetricMap) -> dict[str, Any]:
+    """Return the entries of a tile that follow from its map."""
+    centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
+    known = topomap.georeference
+    return {
+        "map_id": topomap.id,
+        "map_version": topomap.version,
+        "kinds": tuple(topomap.kinds),
+        "num_nodes": len(topomap.summaries),
+        "sessions": tuple(sorted({summary.recording for summary in topomap.summaries})),
+        "focal_px": topomap.max_focal_length_px(),
+        "box_world": np.array([centres.min(axis=0), centres.max(axis=0)]),
+        "georeference": known,
+        "geo_box": None if known is None else geo_box([*map(known.geopoint, centres)]),
     }

@@ -79,7 +79,7 @@ class FeatureType:
         position_weight: weight of a feature's image position beside its descriptor in image
             retrieval (`retrieval/vlad.py`).
         network: name of the network that computes the features, if any (`network_files.py`).
-        sides: feature type of the virtual views of a map (`virtual_views.py`), if it differs from
+        sides: feature type of the virtual views of a map (`extraction.py`), if it differs from
             this one.
     """
 

@@ -5,6 +5,8 @@ Only the two maps are needed. The stored features of the second map's nodes are 
 first map. The second map's nodes are then aligned like the frames of a session
 (`session_poses.py`). Nodes that the first map localizes well are skipped. The other nodes are added
 with their sessions, landmark statistics and virtual nodes.
+
+`move_map` moves a map to another world: all its poses change, and no distance.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
@@ -22,12 +24,21 @@ from topoloc.lifelong.session_poses import align_motion_to_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.config import Progress
-from topoloc.mapping.edit import WaitCallback
+from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.node_drafts import add_virtual_nodes
 from topoloc.mapping.nodes import node_distances
-from topoloc.mapping.storage.entries import Edit, overlay, today
+from topoloc.mapping.storage.entries import (
+    Edge,
+    Edit,
+    NodeSummary,
+    PlaceImage,
+    TopoNode,
+    change_each,
+    overlay,
+    today,
+)
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
-from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId, Row, as_rows
 
 
@@ -220,3 +231,58 @@ def _transfer_virtual_nodes(
             ids = {"of_node": owner.node_id, "session_id": owner.session_id}
             nodes.append(replace(side, summary=replace(of, world_from_cam=moved, **ids)))
     return add_virtual_nodes(first, nodes)
+
+
+T = TypeVar("T", NodeSummary, PlaceImage)
+
+
+def move_map(
+    path: str | Path, new_from_old: Rigid3, name: str = "move", on_wait: WaitCallback | None = None
+) -> None:
+    """Move a map file to another world, as one edit of this name. The history keeps the transform
+    as x, y, z, qx, qy, qz, qw. Its place on earth stays.
+
+    Raises:
+        MapError: the map is missing, damaged, or cannot be written.
+    """
+    w, *ijk = new_from_old.quat_wxyz().tolist()
+    numbers = (*new_from_old.translation.tolist(), *ijk, w)
+    text = " ".join(f"{number:.7g}" for number in numbers)
+    with edit_map(path, on_wait) as edit:
+        moved = with_map_statistics(move_world(edit.topomap, new_from_old))
+        edit.commit(moved, name, {"new_from_old": text})
+
+
+def move_world(topomap: TopoMetricMap, new_from_old: Rigid3) -> TopoMetricMap:
+    """Return the map with all its poses in another world. Its statistics are no longer those of
+    its nodes."""
+
+    def move(of: T) -> T:
+        return replace(of, world_from_cam=new_from_old @ of.world_from_cam)
+
+    def move_node(node: TopoNode) -> TopoNode:
+        return replace(node, summary=move(node.summary))
+
+    known, sides = topomap.georeference, topomap.sides
+    if known is not None:
+        enu_from_new = known.enu_from_world @ new_from_old.inverse()
+        known = replace(known, enu_from_world=enu_from_new)
+    if sides is not None:  # with the places of their retrieval model
+        models = dict(sides.coarse_models)
+        for name, model in models.items():
+            centres = new_from_old.apply(model.arrays["centres"])
+            models[name] = replace(model, arrays={**model.arrays, "centres": centres})
+        summaries, nodes = [*map(move, sides.summaries)], change_each(sides.nodes, move_node)
+        sides = replace(sides, summaries=summaries, nodes=nodes, coarse_models=models)
+    layers = {
+        kind: replace(layer, nodes=change_each(layer.nodes, move_node))
+        for kind, layer in topomap.layers.items()
+    }
+    return replace(
+        topomap,
+        summaries=[*map(move, topomap.summaries)],
+        layers=layers,
+        place_images=change_each(topomap.place_images, move),
+        sides=sides,
+        georeference=known,
+    )

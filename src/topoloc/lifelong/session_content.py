@@ -230,7 +230,7 @@ def create_session_content(
     learnt: Collection[int] = (),
 ) -> SessionContent:
     """Create the content of a session. Queried frames that the map localizes well observe its
-    nodes. The others, and those in `learnt` (by index, `light_learning.py`), become nodes. Frames
+    nodes. The others, and those in `learnt` (by index, `update.py`), become nodes. Frames
     near a new node become mapping images."""
     config, content, d = topomap.config, SessionContent(), topomap.config.d_thresh
     by_index = {frame.index: frame for frame in frames}

@@ -3,7 +3,7 @@ node. Create virtual nodes from the walls beside the trajectory, for queries in 
 direction.
 
 A node's points are found again only from similar directions. Its image also shows the walls on the
-left and right at a slant. `features/virtual_views.py` renders them as seen from the front. Selected
+left and right at a slant. `features/extraction.py` renders them as seen from the front. Selected
 nodes therefore get up to two virtual cameras at the same place that look to the sides, with their
 own features and points. They are not nodes of Eq. 1. The localizer uses them only if nothing else
 gives a pose (`localization/walls/`).
@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from topoloc.disk_list import DiskList
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import FeatureConfig, extract_features, make_virtual_views
 from topoloc.features.features import Features
-from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig

@@ -8,9 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnreadableImageError
-from topoloc.recordings.depth_images import read_depth_image
 from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
-from topoloc.recordings.image_io import read_image
+from topoloc.recordings.image_io import read_depth_image, read_image
 
 
 def leave_out_damaged(

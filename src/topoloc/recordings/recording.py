@@ -10,7 +10,6 @@ from topoloc.errors import UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.depth_images import depth_image_of, read_depth_image
 from topoloc.recordings.frame import (
     DepthImage,
     Image,
@@ -19,7 +18,13 @@ from topoloc.recordings.frame import (
     StereoFrame,
     StereoSequence,
 )
-from topoloc.recordings.image_io import exif_focal_length, find_white_level, read_image
+from topoloc.recordings.image_io import (
+    depth_image_of,
+    exif_focal_length,
+    find_white_level,
+    read_depth_image,
+    read_image,
+)
 
 
 @dataclass(frozen=True, eq=False)

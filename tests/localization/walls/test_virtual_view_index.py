@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from built_corridor import WIDE, back, built_corridor
-from topoloc.features.virtual_views import VirtualView, make_virtual_views
+from topoloc.features.extraction import VirtualView, make_virtual_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.walls.virtual_view_index import (
     CandidatePlaces,

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from built_corridor import WIDE, back, built_corridor, seen_on_the_way_back
-from topoloc.features.extraction import extract_features
+from topoloc.features.extraction import extract_features, make_virtual_views
 from topoloc.features.feature_types import SURF, FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3

@@ -1,7 +1,7 @@
 """Propose poses from virtual views, for a return along a trajectory mapped in one direction.
 
 This is the last source of proposals. The image's views to the left and right
-(`features/virtual_views.py`) are compared with the virtual views of the map. Candidate places come
+(`features/extraction.py`) are compared with the virtual views of the map. Candidate places come
 from `virtual_view_index.py`. A pose that matches of both views agree on (`place_comparison.py`) is
 refined in both together (`virtual_view_matching.py`).
 

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from topoloc.errors import MapError
+from topoloc.features.extraction import VirtualView
 from topoloc.features.features import Features
-from topoloc.features.virtual_views import VirtualView
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.coarse_models import node_ids_to_rows

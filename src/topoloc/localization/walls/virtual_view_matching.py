@@ -10,10 +10,14 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from topoloc.features.extraction import extract_from_normalized, normalize_image
+from topoloc.features.extraction import (
+    VirtualView,
+    extract_from_normalized,
+    make_virtual_views,
+    normalize_image,
+)
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features, Matches
-from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import sample_rows

@@ -1,5 +1,5 @@
 """The same walls seen from both ends: a rendered way out and the way back, as views to the sides
-show them (`topoloc.features.virtual_views`).
+show them (`topoloc.features.extraction`).
 
 Depth comes from the stereo pairs of the way out, poses from the truth. Views are kept as pictures
 of the size that the teacher sees: an upper and a lower band of each.
@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from topoloc.errors import RecordingError
-from topoloc.features.virtual_views import VirtualView, make_virtual_views
+from topoloc.features.extraction import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.frame import StereoFrame, StereoSequence, to_grey
 from topoloc_training.net.pairs import Pair, located_pixels, seen_by

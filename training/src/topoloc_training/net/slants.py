@@ -1,4 +1,4 @@
-"""A wall as a camera shows it that looks along it, and as `topoloc.features.virtual_views` turns
+"""A wall as a camera shows it that looks along it, and as `topoloc.features.extraction` turns
 that to the front again.
 
 What lies ahead on a wall is seen at a slant: it fills fewer and fewer pixels, so that its picture
