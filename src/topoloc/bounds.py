@@ -3,6 +3,9 @@
 `check_bounds` checks values set in Python. `parse_settings` checks values read from a TOML file, a
 map or a stored model. Numbers must be finite, whatever their bounds. A whole number with bounds
 must be at most 2^31 - 1.
+
+Settings that earlier versions had are dropped from files that still contain them.
+`removed_settings.json` holds these keys with their old defaults, in nested tables.
 """
 
 from __future__ import annotations
@@ -11,10 +14,12 @@ import json
 import math
 import re
 import sys
-from collections.abc import Collection, Iterator
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache
+from importlib.resources import files
 from inspect import Parameter, signature
 from numbers import Integral, Real
 from types import NoneType, UnionType
@@ -290,3 +295,61 @@ def _iter_numbers(value: Any) -> Iterator[Any]:
             yield from _iter_numbers(item)
     elif isinstance(value, Real) and not isinstance(value, bool):
         yield int(value) if isinstance(value, Integral) else float(value)
+
+
+def drop_removed_settings(
+    data: Mapping[str, Any], table: str = "", source: str = ""
+) -> dict[str, Any]:
+    """Return nested settings without removed keys and without tables that only held such keys.
+
+    One warning names the removed keys whose values differ from the old defaults.
+
+    Args:
+        table: dotted name of `data`, such as `build`. Default: `data` holds all tables.
+        source: the beginning of the warning, such as the name of the file.
+    """
+    removed = json.loads((files("topoloc") / "removed_settings.json").read_text("utf-8"))
+    for name in table.split(".") if table else ():
+        removed = removed[name]
+    changed = list[str]()
+    left = _drop(data, removed, table, changed)
+    if changed:
+        named = ", ".join(changed)
+        warnings.warn(f"{source}no longer settings, without effect: {named}", stacklevel=3)
+    return left
+
+
+def parse_tables(
+    data: Mapping[str, Any], find_class: Callable[[str], type], source: str
+) -> list[Any]:
+    """Create the configuration of each table of a settings file, without removed settings.
+
+    Args:
+        find_class: returns the dataclass of a table. Raises ConfigError if there is none.
+        source: the beginning of warnings, such as the name of the file.
+
+    Raises:
+        ConfigError: a table or a key is unknown, or a value is invalid. The text names it.
+    """
+    configs = []
+    for name, table in drop_removed_settings(data, source=source).items():
+        with ConfigError.at(quote_key(name)):
+            kind = find_class(name)
+        configs.append(parse_settings(kind, table, name, default=kind()))
+    return configs
+
+
+def _drop(
+    data: Mapping[str, Any], removed: dict[str, Any], table: str, changed: list[str]
+) -> dict[str, Any]:
+    left = dict[str, Any]()
+    for name, value in data.items():
+        key, old = f"{table}.{name}".lstrip("."), removed.get(name)
+        if isinstance(old, dict):
+            rest = _drop(value, old, key, changed) if isinstance(value, dict) else value
+            left |= {} if rest == {} else {name: rest}
+        elif name not in removed:
+            left[name] = value
+        elif value != old:
+            changed.append(key)
+    return left

@@ -1,4 +1,5 @@
-"""Compile functions with Numba, cache their machine code, and set the number of threads.
+"""Compile functions with Numba, cache their machine code, and set the number of threads. Distribute
+work over threads: a band of rows (of an image, of a table of products) per thread, or whole items.
 
 Numba's own cache raises an error at import if the cache folder cannot be written. It also reads no
 code from such a folder. A container's image is often filled while it is built and read-only
@@ -14,10 +15,12 @@ import hashlib
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 from numba.core import config
@@ -38,7 +41,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     A kernel releases the GIL, and its machine code is cached. The option `parallel` is not allowed:
     only one Python thread may use Numba's own threads, but several threads may share a `Localizer`.
-    `features/parallel.py` distributes rows over threads instead.
+    `parallel_for_rows` distributes rows over threads instead.
 
     Raises:
         ValueError: `parallel` is among the options.
@@ -96,7 +99,7 @@ def num_threads(default: int = _DEFAULT_NUM_THREADS) -> int:
 
 def mark_worker_thread() -> None:
     """Mark this Python thread as one of several workers, so that it starts no further threads
-    (`features/parallel.py`)."""
+    (`parallel_map`)."""
     _thread_local.is_worker = True
 
 
@@ -220,3 +223,59 @@ def _warn_not_cached(folders: str) -> None:
         " topoloc.warm_up()'` fills the first; or NUMBA_CACHE_DIR names one that can be written.",
         file=sys.stderr,
     )
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@cache
+def _pool(process_id: int) -> ThreadPoolExecutor:
+    """Return the thread pool of this process. A forked child inherits a pool without its threads,
+    and would wait for them forever."""
+    return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix=f"bands-{process_id}")
+
+
+def parallel_for_rows(
+    run: Callable[[int, int], object], num_rows: int, max_bands: int | None = None
+) -> None:
+    """Call run(first_row, last_row) in parallel for `max_bands` bands of about equal height that
+    cover the rows.
+
+    The default number is that of `set_num_threads`. The calling thread processes one band itself.
+    An exception in any band is raised here.
+    """
+    num_bands = max(1, min(max_bands or num_threads(), num_rows))
+    bounds = [num_rows * band // num_bands for band in range(num_bands + 1)]
+    pool = _pool(os.getpid())
+    others = [pool.submit(run, bounds[band], bounds[band + 1]) for band in range(1, num_bands)]
+    run(0, bounds[1])
+    for other in others:
+        other.result()
+
+
+def parallel_map(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Yield work(item) in the order of the items. As many threads as `set_num_threads` set process
+    one item each.
+
+    With a whole item per thread, no thread waits for part of an image. The Python code for one item
+    also overlaps with the kernels of another. At most one finished result more than there are
+    threads is buffered, which limits memory. An exception is raised in its item's place. The
+    calling thread creates the items.
+    """
+    number = num_threads()
+    if number == 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(number, initializer=mark_worker_thread) as pool:
+        pending: deque[Future[R]] = deque()
+        try:
+            for item in items:
+                pending.append(pool.submit(work, item))
+                if len(pending) > number:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         AtLeast as AtLeast,
         Between as Between,
         describe_ranges as describe_ranges,
+        parse_tables as parse_tables,
         suggest_name as suggest_name,
         with_setting as with_setting,
     )
@@ -92,7 +93,6 @@ if TYPE_CHECKING:
         read_text as read_text,
     )
     from topoloc.recordings.trajectory import has_answers as has_answers
-    from topoloc.removed_settings import parse_tables as parse_tables
     from topoloc.retrieval.coarse import (
         CoarseLocalizer as CoarseLocalizer,
         CoarseModel as CoarseModel,
@@ -103,7 +103,9 @@ if TYPE_CHECKING:
 _NAMES = {
     "topoloc.atlas.manifest": "check_tile_id",
     "topoloc.atlas.tile_fetcher": "TilePending",
-    "topoloc.bounds": "Above AtLeast Between describe_ranges suggest_name with_setting",
+    "topoloc.bounds": (
+        "Above AtLeast Between describe_ranges parse_tables suggest_name with_setting"
+    ),
     "topoloc.compiled": "kernel_caches",
     "topoloc.evaluation.metrics": "format_length",
     "topoloc.evaluation.node_matching": "NodeMatcher",
@@ -135,7 +137,6 @@ _NAMES = {
     "topoloc.recordings.stored_images": "encode_jpeg",
     "topoloc.recordings.text_files": "parse_relative_path read_text",
     "topoloc.recordings.trajectory": "has_answers",
-    "topoloc.removed_settings": "parse_tables",
     "topoloc.retrieval.coarse": "CoarseLocalizer CoarseModel NodeScore register_coarse_localizer",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from topoloc import compiled
-from topoloc.features.parallel import parallel_for_rows, parallel_map
+from topoloc.compiled import parallel_for_rows, parallel_map
 
 
 @pytest.mark.parametrize(("num_rows", "num_threads"), [(1, 4), (7, 1), (7, 3), (480, 2)])

@@ -21,10 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.compiled import kernel
+from topoloc.compiled import kernel, parallel_for_rows
 from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.features import Features
-from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 

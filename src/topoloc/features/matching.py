@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
+from topoloc.compiled import parallel_for_rows
 from topoloc.features.features import Matches, MatchingConfig
 from topoloc.features.matching_kernels import (
     GROUP,
@@ -22,7 +23,6 @@ from topoloc.features.matching_kernels import (
     find_similar,
     largest_products,
 )
-from topoloc.features.parallel import parallel_for_rows
 
 _LOWE_RATIO = 0.8
 _FLANN_KDTREE = 1

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
 
-from topoloc.compiled import num_threads as default_num_threads
+from topoloc.compiled import num_threads as default_num_threads, parallel_for_rows
 from topoloc.features.features import Features
-from topoloc.features.parallel import parallel_for_rows
 from topoloc.features.surf_descriptor_kernels import describe, orient, smooth_rows
 from topoloc.features.surf_detector_kernels import detect_band, integral_image, split_columns
 

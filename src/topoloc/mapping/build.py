@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from topoloc.bounds import check_bounds
+from topoloc.compiled import parallel_map
 from topoloc.disk_list import DiskList
 from topoloc.errors import EmptyMapError
-from topoloc.features.parallel import parallel_map
 from topoloc.mapping.config import MapConfig, Progress
 from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations
 from topoloc.mapping.mapping_frames import (

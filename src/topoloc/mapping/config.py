@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Protocol, runtime_checkable
 
-from topoloc.bounds import AtLeast, parse_settings
+from topoloc.bounds import AtLeast, drop_removed_settings, parse_settings
 from topoloc.errors import ConfigError
 from topoloc.features.feature_types import (
     SURF,
@@ -18,7 +18,6 @@ from topoloc.features.feature_types import (
 from topoloc.json_data import OneLine, decode_json
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.validation import CorruptDataError
-from topoloc.removed_settings import drop_removed_settings
 from topoloc.retrieval.coarse import VladConfig
 
 CONFIG_VERSION = 1

@@ -16,10 +16,10 @@ from typing import TypeVar
 
 import cv2
 
+from topoloc.compiled import parallel_map
 from topoloc.errors import TrajectoryError
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
-from topoloc.features.parallel import parallel_map
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3

@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from topoloc.compiled import parallel_for_rows
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
-from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import (
     StereoRig,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from topoloc.features.parallel import parallel_for_rows
+from topoloc.compiled import parallel_for_rows
 from topoloc.points.point_tracking_kernels import refine_tracks, select_cell_corners
 
 

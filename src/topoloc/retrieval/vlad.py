@@ -25,10 +25,9 @@ from dataclasses import asdict
 import numpy as np
 from jaxtyping import Float32, Int, Int8
 
-from topoloc.bounds import parse_settings
+from topoloc.bounds import drop_removed_settings, parse_settings
 from topoloc.errors import MapError
 from topoloc.features.features import Features
-from topoloc.removed_settings import drop_removed_settings
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, VladConfig, model_array
 from topoloc.retrieval.descriptor_index import DescriptorIndex, learn_visual_words, learn_whitening
 from topoloc.retrieval.descriptor_kernels import add_residuals, max_shifted_products, multiply_rows

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.features.parallel import parallel_map
+from topoloc.compiled import parallel_map
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import downscale_image, prepare_frame
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.compiled import parallel_map
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import match_features
-from topoloc.features.parallel import parallel_map
 from topoloc.geometry.pose_conventions import UNITS
 from topoloc.points.metric_points import MeasuredView
 from topoloc.points.point_tracking import align_with_reference

@@ -15,8 +15,8 @@ from itertools import groupby, pairwise
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.compiled import parallel_map
 from topoloc.disk_list import DiskList
-from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from topoloc.compiled import parallel_map
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features, MatchingConfig
 from topoloc.features.matching import find_similar_pairs, match_features
-from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.geometry.alignment import normalized_pose_error, rotation_error
 from topoloc.geometry.camera import Camera

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from topoloc.features.parallel import parallel_map
+from topoloc.compiled import parallel_map
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3

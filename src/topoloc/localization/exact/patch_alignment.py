@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from msgspec import Struct
 
+from topoloc.compiled import parallel_for_rows
 from topoloc.errors import FeatureTypeError, MapError
-from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.json_data import Finite, decode_json

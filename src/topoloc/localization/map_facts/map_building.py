@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.compiled import parallel_map
 from topoloc.errors import TrajectoryError
 from topoloc.features.feature_types import find_feature_type
-from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import select_hypothesis
 from topoloc.localization.config import LocalizerConfig

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from topoloc.compiled import parallel_map
 from topoloc.errors import MapError
-from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import encode_statistics
 from topoloc.mapping.storage.entries import Session, TopoNode
