@@ -307,7 +307,7 @@ def test_a_map_that_is_replaced_while_the_edit_is_written_stays(
         os.replace(other, path)
         return kept
 
-    monkeypatch.setattr("topoloc.mapping.edit.keep_file", keep_slowly)
+    monkeypatch.setattr("topoloc.mapping.storage.map_writing.keep_file", keep_slowly)
     with (
         edit_map(map_file) as edit,
         pytest.raises(MapError, match="was replaced during the edit"),

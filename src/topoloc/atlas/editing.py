@@ -7,6 +7,7 @@ starts again with the new manifest. So no writer loses a tile of another.
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -77,16 +78,13 @@ def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
     """Create an atlas of these tiles and return its manifest. Raises AtlasError if there is an
     atlas already or it cannot be written, MapError if a map is missing, damaged or empty."""
     store = store_at(where)
-    exists = AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
-    if store.manifest() is not None:
-        raise exists
-    with removing_new_files_on_failure(store) as put:
-        tiles = {tile.tile_id: store_tile(tile, put) for tile in new}
-        after = Manifest().with_tiles(tiles, time.time())
-        if not store.commit(None, after.to_bytes()):
-            raise exists
-    _restore_files(store, new, list(tiles.values()))
-    return after
+
+    def create(manifest: Manifest, added: Mapping[str, Tile], now: float) -> Manifest:
+        if store.manifest() is not None:
+            raise AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
+        return manifest.with_tiles(added, now)
+
+    return _store_and_commit(store, new, create, grace_s=math.inf, creates=True)
 
 
 def add_tiles(
@@ -103,20 +101,12 @@ def add_tiles(
     created (`creates`) or AtlasError is raised. Raises MapError if a map is missing, damaged or
     empty.
     """
-    store = store_at(where)
-    # before the work, and again with each try
-    _check_ids_free(read_manifest(store, creates)[1], new, replaces)
-    added = dict[str, Tile]()
 
-    def with_added(manifest: Manifest, now: float) -> Manifest:
+    def add(manifest: Manifest, added: Mapping[str, Tile], now: float) -> Manifest:
         _check_ids_free(manifest, new, replaces)
         return manifest.with_tiles(manifest.by_id | added, now)
 
-    with removing_new_files_on_failure(store) as put:
-        added |= {tile.tile_id: store_tile(tile, put) for tile in new}
-        after = _commit_change(store, with_added, grace_s, creates)
-    _restore_files(store, new, list(added.values()))
-    return after
+    return _store_and_commit(store_at(where), new, add, grace_s, creates)
 
 
 def replace_tile(where: str, new: NewTile, before: Tile) -> Manifest | None:
@@ -126,22 +116,39 @@ def replace_tile(where: str, new: NewTile, before: Tile) -> Manifest | None:
     If the tile was removed or changed since `before`, nothing is changed and None is returned.
     Raises AtlasError and MapError as `add_tiles`.
     """
-    store, stored = store_at(where), dict[str, Tile]()
 
-    def with_replaced(manifest: Manifest, now: float) -> Manifest:
+    def replace_map(manifest: Manifest, added: Mapping[str, Tile], now: float) -> Manifest:
         is_same = _is_same_map(manifest, before)
         if not is_same or manifest.by_id[before.tile_id].world != before.world:
             raise _TileChangedError
         joins = [join for join in manifest.joins if before.tile_id in join.pair]
-        return manifest.with_tiles(manifest.by_id | stored, now, joins)
+        return manifest.with_tiles(manifest.by_id | added, now, joins)
 
-    try:
-        with removing_new_files_on_failure(store) as put:
-            stored[new.tile_id] = store_tile(new, put)
-            after = _commit_change(store, with_replaced)
-    except _TileChangedError:
-        return None
-    _restore_files(store, [new], list(stored.values()))
+    with suppress(_TileChangedError):
+        return _store_and_commit(store_at(where), [new], replace_map)
+    return None
+
+
+def _store_and_commit(
+    store: Store,
+    new: Sequence[NewTile],
+    change: Callable[[Manifest, Mapping[str, Tile], float], Manifest],
+    grace_s: float = GRACE_S,
+    creates: bool = False,
+) -> Manifest:
+    """Store the files of new tiles and commit the manifest that `change` makes of them, by their
+    id. `change` is called before the files are stored, too, so that its errors come early."""
+    change(read_manifest(store, creates)[1], {}, time.time())
+    with removing_new_files_on_failure(store) as put:
+        added = {tile.tile_id: store_tile(tile, put) for tile in new}
+        after = _commit_change(
+            store, lambda manifest, now: change(manifest, added, now), grace_s, creates
+        )
+    # another writer may have removed files as unreferenced before the commit
+    names = set(store.ages(TILES))
+    for tile in new:
+        if not {stored.name for stored in added[tile.tile_id].files} <= names:
+            store_tile(tile, store.put)
     return after
 
 
@@ -236,14 +243,6 @@ def _store_file(put: PutFile, name: str, path: Path) -> StoredFile:
     stored = StoredFile(f"{TILES}/{stem}-{sha256[:12]}.{suffix}", sha256, path.stat().st_size)
     put(stored.name, path)
     return stored
-
-
-def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
-    """Store files again that another writer removed as unreferenced before the commit."""
-    names = set(store.ages(TILES))
-    for one, tile in zip(new, tiles, strict=True):
-        if not {stored.name for stored in tile.files} <= names:
-            store_tile(one, store.put)
 
 
 class _TileChangedError(Exception):

@@ -18,18 +18,16 @@ from topoloc.errors import MapError
 from topoloc.mapping.storage.entries import Edit, today
 from topoloc.mapping.storage.kept_files import (
     WaitCallback,
-    drop_kept_files,
     find_fault,
     find_kept_files,
-    keep_file,
     lock_map_file,
     warn_of_damage,
 )
-from topoloc.mapping.storage.map_writing import write_map
+from topoloc.mapping.storage.map_writing import replace_file
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.validation import describe_failure
-from topoloc.recordings.atomic import atomic_write, fsync, replace as replace_file
+from topoloc.recordings.atomic import replace as rename
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
@@ -55,22 +53,11 @@ class MapEdit:
         """
         edits = self.topomap.edits
         edit = Edit(self.topomap.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
-        kept = None
-        try:
-            with atomic_write(self.path) as temporary:
-                write_map(replace(changed, edits=[*edits, edit]), temporary)
-                fsync(temporary)  # takes long, so it comes before the check
-                kept = keep_file(self.path, temporary)
-                self.check_still_locked()
-        except (OSError, MapError) as error:
-            if kept is not None:
-                kept.unlink(missing_ok=True)
-            if isinstance(error, MapError):
-                raise
-            raise MapError(f"cannot write map {self.path}: {describe_failure(error)}") from error
+        named = replace(changed, edits=[*edits, edit])
+        kept = replace_file(named, self.path, check=self.check_still_locked)
         # The newest was read just now. Of the older ones the next alone is read: all together have
         # up to `_MAX_BYTES`. `read_history` reads all, and `undo_edit` the one that it restores.
-        warn_of_damage(drop_kept_files(self.path, kept)[1:2])
+        warn_of_damage(kept[1:2])
         return edit
 
     def check_still_locked(self) -> None:
@@ -119,7 +106,7 @@ def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
             edit.check_still_locked()
             if fault := find_fault(kept[0]):
                 raise MapError(fault)
-            replace_file(kept[0], edit.path)
+            rename(kept[0], edit.path)
         except OSError as error:
             raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
     return last

@@ -14,7 +14,7 @@ from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence, sequence_subset
-from topoloc.recordings.recording import recording_notes
+from topoloc.recordings.recording import leave_out_damaged, recording_notes
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
 # accepts any other folder with images. A format's module is imported when the format is tried.
@@ -92,11 +92,7 @@ def open_sequence(
         if not indices:
             raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
         sequence = sequence_subset(sequence, indices)
-    if not whole_only:
-        return sequence
-    from topoloc.recordings.damaged_images import leave_out_damaged  # queries do not need it
-
-    return leave_out_damaged(sequence, warn)
+    return leave_out_damaged(sequence, warn) if whole_only else sequence
 
 
 def _open_recording(

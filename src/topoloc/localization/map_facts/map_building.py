@@ -25,9 +25,9 @@ from topoloc.mapping.config import Progress
 from topoloc.mapping.storage.entries import CorrelatedErrors
 from topoloc.mapping.topomap import Repetitions, TopoMetricMap
 from topoloc.node_ids import NodeId
-from topoloc.recordings.damaged_images import leave_out_damaged
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import leave_out_damaged
 from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.input_checks import check_pose_coverage, check_stereo
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view

@@ -11,7 +11,7 @@ import io
 import json
 import os
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from hashlib import blake2b
@@ -38,7 +38,7 @@ from topoloc.mapping.storage.schema import (
     layer_suffix,
 )
 from topoloc.mapping.validation import describe_failure, sqlite_failures_as_os_errors
-from topoloc.recordings.atomic import atomic_write
+from topoloc.recordings.atomic import atomic_write, fsync
 from topoloc.retrieval.coarse import CoarseModel
 
 if TYPE_CHECKING:
@@ -65,21 +65,36 @@ def save_map(
     """
     if os.path.isdir(path):  # Path.is_dir raises an error for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
-    kept = None
+    with no_edit_of(path, on_wait):
+        replace_file(topomap, path, is_old_kept)
+
+
+def replace_file(
+    topomap: TopoMetricMap,
+    path: Path,
+    is_old_kept: bool = True,
+    check: Callable[[], None] = lambda: None,
+) -> Sequence[Path]:
+    """Write the map to `path` atomically, after `check`. Return the files that are kept of it now,
+    the newest first. Raises MapError, which leaves nothing behind."""
+    kept, place = None, path
     try:
-        with no_edit_of(path, on_wait), atomic_write(path) as temporary:
+        place = Path(os.path.realpath(path))
+        with atomic_write(path) as temporary:
             write_map(topomap, temporary)
+            fsync(temporary)  # takes long, so it comes before the check
             if is_old_kept and os.path.isfile(path):
-                kept = keep_file(Path(os.path.realpath(path)), temporary)
-    except (OSError, ValueError) as error:
+                kept = keep_file(place, temporary)
+            check()
+    except (OSError, ValueError, MapError) as error:
         if kept is not None:
             kept.unlink(missing_ok=True)
         # a null character in the name; any other ValueError is a bug
-        if isinstance(error, ValueError) and "null" not in str(error):
+        is_bug = isinstance(error, ValueError) and "null" not in str(error)
+        if is_bug or isinstance(error, MapError):
             raise
         raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
-    if kept is not None:
-        drop_kept_files(Path(os.path.realpath(path)), kept)
+    return [] if kept is None else drop_kept_files(place, kept)
 
 
 def write_map(topomap: TopoMetricMap, path: Path) -> None:
