@@ -79,7 +79,7 @@ def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
     atlas already or it cannot be written, MapError if a map is missing, damaged or empty."""
     store = store_at(where)
 
-    def create(manifest: Manifest, added: Mapping[str, Tile], now: float) -> Manifest:
+    def create(manifest: Manifest, added: dict[str, Tile], now: float) -> Manifest:
         if store.manifest() is not None:
             raise AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
         return manifest.with_tiles(added, now)
@@ -102,7 +102,7 @@ def add_tiles(
     empty.
     """
 
-    def add(manifest: Manifest, added: Mapping[str, Tile], now: float) -> Manifest:
+    def add(manifest: Manifest, added: dict[str, Tile], now: float) -> Manifest:
         _check_ids_free(manifest, new, replaces)
         return manifest.with_tiles(manifest.by_id | added, now)
 
@@ -117,7 +117,7 @@ def replace_tile(where: str, new: NewTile, before: Tile) -> Manifest | None:
     Raises AtlasError and MapError as `add_tiles`.
     """
 
-    def replace_map(manifest: Manifest, added: Mapping[str, Tile], now: float) -> Manifest:
+    def replace_map(manifest: Manifest, added: dict[str, Tile], now: float) -> Manifest:
         is_same = _is_same_map(manifest, before)
         if not is_same or manifest.by_id[before.tile_id].world != before.world:
             raise _TileChangedError
@@ -132,7 +132,7 @@ def replace_tile(where: str, new: NewTile, before: Tile) -> Manifest | None:
 def _store_and_commit(
     store: Store,
     new: Sequence[NewTile],
-    change: Callable[[Manifest, Mapping[str, Tile], float], Manifest],
+    change: Callable[[Manifest, dict[str, Tile], float], Manifest],
     grace_s: float = GRACE_S,
     creates: bool = False,
 ) -> Manifest:
