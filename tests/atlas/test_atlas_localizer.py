@@ -20,8 +20,8 @@ from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import query
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_query import MapQuery
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
-from topoloc.localization.schedule import TileQuery
 from topoloc.mapping.topomap import TopoMetricMap
 
 BUDGET = 100_000_000
@@ -108,10 +108,10 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
     atlas: Path, monkeypatch: pytest.MonkeyPatch, min_similarity: float, num_asked: int
 ):
     asked = list[str]()
-    exhaustive = TileQuery.exhaustive
+    exhaustive = MapQuery.search_all
     monkeypatch.setattr(
-        TileQuery,
-        "exhaustive",
+        MapQuery,
+        "search_all",
         lambda self: asked.append(self.opened.map_id) or exhaustive(self),
     )
     monkeypatch.setattr(Wide, "min_similarity", min_similarity)
@@ -138,10 +138,10 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(
 ):
     """Neither does it cost a glance, nor is it named."""
     asked = list[str]()
-    glance = TileQuery.coarse_only
+    glance = MapQuery.search_first
     monkeypatch.setattr(
-        TileQuery,
-        "coarse_only",
+        MapQuery,
+        "search_first",
         lambda self: asked.append(self.opened.first.map.kind.name) or glance(self),
     )
     monkeypatch.setattr(Wide, "max_rival_gap", 2.0)

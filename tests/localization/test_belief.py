@@ -13,6 +13,7 @@ from hypothesis import given, strategies as st
 from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
 from msgspec import structs
 
+from topoloc.localization.answer import lead
 from topoloc.localization.belief import (
     Belief,
     Hypothesis,
@@ -22,14 +23,13 @@ from topoloc.localization.belief import (
 from topoloc.localization.config import EvidenceConfig, LocalizerConfig
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.result_decision import decide_result
 
 CONFIG = EvidenceConfig()
 POINTS = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3))
 
 
 def _answered(*hypotheses: Hypothesis) -> Localization | NotLocalized:
-    return decide_result(believed(list(hypotheses)))[0]
+    return lead(believed(list(hypotheses))).result
 
 
 def _along(result: Localization | NotLocalized) -> float:
@@ -124,7 +124,7 @@ def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(
 @given(some_hypotheses)
 def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
     search = believed(hypotheses)
-    result, _ = decide_result(search)
+    result = lead(search).result
     if isinstance(result, Localization):
         assert search.best is not None
         assert result.world_from_cam == search.best.world_from_cam or np.array_equal(
@@ -261,11 +261,9 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
     search = believed(
         [made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)]
     )
-    assert isinstance(decide_result(search)[0], Localization)
+    assert isinstance(lead(search).result, Localization)
     strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
-    assert (
-        isinstance(decide_result(replace(search, weights=strict))[0], Localization) == is_answered
-    )
+    assert isinstance(lead(replace(search, weights=strict)).result, Localization) == is_answered
 
 
 def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
@@ -278,7 +276,7 @@ def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
                 made_hypothesis(2.5 - WEIGHTS.rivals.lead - 0.1),
             ]
         )
-        assert isinstance(decide_result(replace(search, weights=strict))[0], Localization) == walls
+        assert isinstance(lead(replace(search, weights=strict)).result, Localization) == walls
 
 
 @pytest.mark.parametrize("doubt", [0.9, 1.5])
@@ -290,7 +288,7 @@ def test_an_unclear_pose_of_nodes_must_lead_walls_by_far_only_if_they_could_be_a
     search = believed(
         [made_hypothesis(2.5), made_hypothesis(behind, x=-9.0, walls=True, doubt=doubt)]
     )
-    result = decide_result(replace(search, weights=strict))[0]
+    result = lead(replace(search, weights=strict)).result
     assert isinstance(result, Localization) == (doubt > 1.0)
 
 
@@ -381,7 +379,7 @@ def test_a_search_that_was_cut_short_says_so():
     for hypotheses in ([], [made_hypothesis(-2.0)], [imprecise], alike):
         search = believed(hypotheses)
         search.is_stopped = True
-        result, _ = decide_result(search)
+        result = lead(search).result
         assert isinstance(result, NotLocalized)
         assert "time was up" in result.detail
 
@@ -389,7 +387,7 @@ def test_a_search_that_was_cut_short_says_so():
 def test_what_is_asked_of_an_answer_can_be_set():
     strict = LocalizerConfig(evidence=EvidenceConfig(min_probability=0.95))
     for log_odds, is_answer in ((2.0, False), (4.0, True)):
-        result, _ = decide_result(believed([made_hypothesis(log_odds)], strict))
+        result = lead(believed([made_hypothesis(log_odds)], strict)).result
         assert isinstance(result, Localization) is is_answer
 
 

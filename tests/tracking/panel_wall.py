@@ -7,12 +7,12 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.answer import LocalizationWithInliers
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.query import Deadline, QueryImage
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.localization.result_decision import LocalizationWithInliers
 from topoloc.localization.search import Trace
 from topoloc.localization.tiles.tiles import Tiles
 from topoloc.mapping.topomap import TopoMetricMap

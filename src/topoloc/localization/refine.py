@@ -15,6 +15,7 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.answer import Answer, lead
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.evidence import (
     compute_best_case_evidence,
@@ -24,8 +25,6 @@ from topoloc.localization.evidence import (
 from topoloc.localization.guided import match_guided
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.provenance import Evidence
-from topoloc.localization.result import Localization
-from topoloc.localization.result_decision import ResultWithInliers, decide_final_result
 from topoloc.localization.search import Proposal, Search
 from topoloc.node_ids import NodeId, Row
 
@@ -173,7 +172,7 @@ def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:
         return compute_best_case_evidence(search, final, final.pose.inflated(inflated))
 
 
-def confirm_hypotheses(first: Search, last: Search) -> ResultWithInliers:
+def confirm_hypotheses(first: Search, last: Search) -> Answer:
     """Confirm the hypotheses of the first feature type with the last one.
 
     The reported pose is the one with the higher log-odds. In changed light, points of the first
@@ -193,12 +192,11 @@ def confirm_hypotheses(first: Search, last: Search) -> ResultWithInliers:
             if from_last is not None and is_from_last:
                 by_last[id(one)] = replace(from_last, log_odds=one.log_odds)
         confirmed = confirmed.with_hypothesis(one, config, weights)
-    outcome = decide_final_result(replace(first, belief=confirmed))
-    best = confirmed.best(weights)
-    if not isinstance(outcome[0], Localization) or best is None or id(best) not in by_last:
-        return outcome
-    belief = Belief().with_hypothesis(by_last[id(best)], config, last.weights.rivals)
-    return decide_final_result(replace(last, belief=belief))
+    answer = lead(replace(first, belief=confirmed))
+    if answer.pose is None or id(answer.best) not in by_last:
+        return answer
+    belief = Belief().with_hypothesis(by_last[id(answer.best)], config, last.weights.rivals)
+    return lead(replace(last, belief=belief))
 
 
 def cross_check_hypothesis(

@@ -16,7 +16,7 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import localizer as localizer_module, schedule
+from topoloc.localization import map_query
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
 from topoloc.localization.fitted_weights import load_fitted_weights
@@ -75,7 +75,7 @@ def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     """What other proposals are for."""
-    monkeypatch.setattr(schedule, "propose_more", lambda _: iter(()))
+    monkeypatch.setattr(map_query, "propose_more", lambda _: iter(()))
     localizer = Localizer(twice(room))
     results = [localizer.localize(picture, CAMERA) for picture, _ in unseen_views()]
     assert not any(
@@ -271,7 +271,7 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(
         followed.append(proposal)
         return verify(proposal)
 
-    monkeypatch.setattr(localizer_module, "verify", follow)
+    monkeypatch.setattr(map_query, "verify", follow)
     for picture, _ in unseen_views():
         followed.clear()
         assert isinstance(Localizer(room).localize(picture, CAMERA), Localization)

@@ -12,7 +12,7 @@ from doubled_room import twice
 from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
-from topoloc.localization import schedule
+from topoloc.localization import map_query
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.proposals import votes
@@ -58,7 +58,7 @@ def test_votes_find_the_place_when_other_nodes_rank_first(
         assert isinstance(found, Localization)
         assert translation_error(found.world_from_cam, truth) < 0.05
     assert "votes" in {one.source for one in trace.tried}
-    monkeypatch.setattr(schedule, "propose_voted_places", lambda _: iter(()))
+    monkeypatch.setattr(map_query, "propose_voted_places", lambda _: iter(()))
     lost = [localizer.localize(picture, CAMERA) for picture, _ in views]
     assert sum(isinstance(one, NotLocalized) for one in lost) >= len(views) // 2
 

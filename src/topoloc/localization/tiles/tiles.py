@@ -18,16 +18,16 @@ from topoloc.errors import AtlasError, MapError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.answer import (
+    MIN_ALTERNATIVE_RATIO,
+    LocalizationWithInliers,
+    ResultWithInliers,
+)
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.query import QueryImage, StageClock
 from topoloc.localization.result import Alternative, Localization, NotLocalized, R
-from topoloc.localization.result_decision import (
-    MIN_ALTERNATIVE_RATIO,
-    LocalizationWithInliers,
-    ResultWithInliers,
-)
 
 if TYPE_CHECKING:
     from topoloc.atlas.location_prior import LocationPrior
