@@ -48,7 +48,7 @@ if TYPE_CHECKING:
         WeightsError as WeightsError,
     )
     from topoloc.evaluation.certification import Certification as Certification, certify as certify
-    from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery
+    from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery, WorldFit as WorldFit
     from topoloc.evaluation.query_localization import (
         Evaluation as Evaluation,
         evaluate as evaluate,
@@ -56,8 +56,7 @@ if TYPE_CHECKING:
         localize_out_of_map as localize_out_of_map,
         localize_queries as localize_queries,
     )
-    from topoloc.evaluation.world_alignment import WorldFit as WorldFit
-    from topoloc.geometry.camera import Camera as Camera
+    from topoloc.geometry.camera import Camera as Camera, UncalibratedCamera as UncalibratedCamera
     from topoloc.geometry.geodesy import (
         GeoPoint as GeoPoint,
         GeoPose as GeoPose,
@@ -66,7 +65,6 @@ if TYPE_CHECKING:
     from topoloc.geometry.pose_conventions import PoseConventions as PoseConventions
     from topoloc.geometry.rig import StereoRig as StereoRig
     from topoloc.geometry.rigid import Rigid3 as Rigid3
-    from topoloc.geometry.uncalibrated_camera import UncalibratedCamera as UncalibratedCamera
     from topoloc.lifelong.growing import GrowingMap as GrowingMap, Growth as Growth
     from topoloc.lifelong.merge import merge as merge
     from topoloc.lifelong.move import move_map as move_map
@@ -101,21 +99,24 @@ if TYPE_CHECKING:
     )
     from topoloc.localization.search import Trace as Trace, TriedProposal as TriedProposal
     from topoloc.mapping.build import BuildConfig as BuildConfig
-    from topoloc.mapping.edit import read_history as read_history, undo_edit as undo_edit
+    from topoloc.mapping.edit import (
+        read_history as read_history,
+        set_look_alike_floors as set_look_alike_floors,
+        undo_edit as undo_edit,
+    )
     from topoloc.mapping.georeference import (
         GeoreferenceResult as GeoreferenceResult,
         georeference as georeference,
     )
-    from topoloc.mapping.sessions import Illumination as Illumination
-    from topoloc.mapping.storage.entries import TopoNode as TopoNode
+    from topoloc.mapping.storage.entries import Illumination as Illumination, TopoNode as TopoNode
     from topoloc.mapping.topomap import TopoMetricMap as TopoMetricMap
     from topoloc.recordings.frame import (
         DepthImage as DepthImage,
         Image as Image,
+        MemorySequence as MemorySequence,
         StereoFrame as StereoFrame,
         StereoSequence as StereoSequence,
     )
-    from topoloc.recordings.frame_checks import MemorySequence as MemorySequence
     from topoloc.recordings.image_io import read_depth as read_depth, read_image as read_image
     from topoloc.recordings.open import open_sequence as open_sequence
     from topoloc.recordings.trajectory import (
@@ -152,17 +153,15 @@ _NAMES = {
         "TrajectoryError UnreadableImageError WeightsError"
     ),
     "topoloc.evaluation.certification": "Certification certify",
-    "topoloc.evaluation.metrics": "EvaluatedQuery",
+    "topoloc.evaluation.metrics": "EvaluatedQuery WorldFit",
     "topoloc.evaluation.query_localization": (
         "Evaluation evaluate find_frames_with_truth localize_out_of_map localize_queries"
     ),
-    "topoloc.evaluation.world_alignment": "WorldFit",
-    "topoloc.geometry.camera": "Camera",
+    "topoloc.geometry.camera": "Camera UncalibratedCamera",
     "topoloc.geometry.geodesy": "GeoPoint GeoPose Georeference",
     "topoloc.geometry.pose_conventions": "PoseConventions",
     "topoloc.geometry.rig": "StereoRig",
     "topoloc.geometry.rigid": "Rigid3",
-    "topoloc.geometry.uncalibrated_camera": "UncalibratedCamera",
     "topoloc.lifelong.growing": "GrowingMap Growth",
     "topoloc.lifelong.move": "move_map",
     "topoloc.lifelong.merge": "merge",
@@ -179,14 +178,12 @@ _NAMES = {
     "topoloc.localization.search": "Trace TriedProposal",
     "topoloc.tracking.shared_cameras": "SharedCameras",
     "topoloc.mapping.build": "BuildConfig",
-    "topoloc.mapping.edit": "read_history undo_edit",
+    "topoloc.mapping.edit": "read_history set_look_alike_floors undo_edit",
     "topoloc.mapping.georeference": "GeoreferenceResult georeference",
-    "topoloc.mapping.sessions": "Illumination",
-    "topoloc.mapping.storage.entries": "TopoNode",
+    "topoloc.mapping.storage.entries": "Illumination TopoNode",
     "topoloc.mapping.topomap": "TopoMetricMap",
-    "topoloc.recordings.frame": "DepthImage Image StereoFrame StereoSequence",
+    "topoloc.recordings.frame": "DepthImage Image MemorySequence StereoFrame StereoSequence",
     "topoloc.recordings.image_io": "read_depth read_image",
-    "topoloc.recordings.frame_checks": "MemorySequence",
     "topoloc.recordings.open": "open_sequence",
     "topoloc.recordings.trajectory": (
         "Trajectory align_to_trajectory with_pose_conventions with_trajectory"

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
         parse_calibration as parse_calibration,
         replace_cameras as replace_cameras,
     )
-    from topoloc.recordings.camera_json import (
+    from topoloc.recordings.camera_files import (
         CameraCalibration as CameraCalibration,
         read_camera_json as read_camera_json,
     )
@@ -121,7 +121,7 @@ _NAMES = {
         " write_folder write_text"
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
-    "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",
+    "topoloc.recordings.camera_files": "CameraCalibration read_camera_json",
     "topoloc.recordings.depth_images": "read_depth_image depth_image_of",
     "topoloc.recordings.format": (
         "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topoloc.atlas.joins import Join
-from topoloc.atlas.joint_worlds import adjust_joins
+from topoloc.atlas.joint_worlds import Join, adjust_joins
 from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference

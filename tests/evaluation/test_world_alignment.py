@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.evaluation.metrics import EvaluatedQuery
-from topoloc.evaluation.world_alignment import fit_worlds
+from topoloc.evaluation.metrics import EvaluatedQuery, fit_worlds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
 

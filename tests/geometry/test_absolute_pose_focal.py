@@ -10,13 +10,13 @@ from topoloc.errors import CalibrationError
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.camera import UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
     WeighedCamera,
 )
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 
 CAM_FROM_WORLD = Rigid3(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 1.0]))
 UNKNOWN = UncalibratedCamera.unknown(640, 480)

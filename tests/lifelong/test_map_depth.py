@@ -8,7 +8,7 @@ import numpy as np
 
 import topoloc.demo
 from topoloc import open_sequence
-from topoloc.lifelong.map_depth import MapPointLocator
+from topoloc.lifelong.session_content import MapPointLocator
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.mapping_frames import extract_mapping_image, select_posed_frames

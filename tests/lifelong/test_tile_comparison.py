@@ -17,7 +17,7 @@ from tiny_world import CAMERA, Panel, path_pose, render, room, write_stereo_reco
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins, add_tiles, create_atlas, new_tiles, remove_tiles
-from topoloc.atlas.joins import sigmas_at
+from topoloc.atlas.joint_worlds import sigmas_at
 from topoloc.atlas.location_prior import WorldPositionPrior, tiles_in_reach
 from topoloc.atlas.manifest import Manifest
 from topoloc.geometry.alignment import rotation_error, translation_error

@@ -15,9 +15,8 @@ from scipy import ndimage
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.apps.report.explanation import explain, explanation_to_json
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.exact import last_step, patch_alignment
 from topoloc.localization.exact.last_step import Surroundings
 from topoloc.localization.exact.patch_alignment import load_last_step_weights

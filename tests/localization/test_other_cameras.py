@@ -12,9 +12,8 @@ from hypothesis import given, strategies as st
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA, path_pose, render, room
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.evidence import highest_probability
 from topoloc.localization.localizer import Localizer, LocalizerConfig

@@ -19,7 +19,7 @@ from topoloc.mapping.coarse_models import (
     node_ids_to_rows,
     open_map_coarse_localizer,
 )
-from topoloc.mapping.sessions import Illumination, Session
+from topoloc.mapping.storage.entries import Illumination, Session
 from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
 from topoloc.retrieval.vlad import SurfVlad

@@ -18,7 +18,8 @@ from hypothesis import example, given, settings, strategies as st
 from mutations import forge
 
 from topoloc.errors import TopolocError
-from topoloc.mapping.edit import edit_map, find_kept_files, read_history, undo_edit
+from topoloc.mapping.edit import edit_map, read_history, undo_edit
+from topoloc.mapping.storage.kept_files import find_kept_files
 from topoloc.mapping.storage.schema import TABLES
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "aea690a" / "pruned.topo"

@@ -15,7 +15,7 @@ from built_corridor import WIDE, built_corridor, seen_ahead
 from topoloc.errors import MapError
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.sessions import Session
+from topoloc.mapping.storage.entries import Session
 from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 

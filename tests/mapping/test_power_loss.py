@@ -16,8 +16,9 @@ from typing import Any
 import pytest
 
 from topoloc.errors import MapError
-from topoloc.mapping.edit import edit_map, find_kept_files, undo_edit
+from topoloc.mapping.edit import edit_map, undo_edit
 from topoloc.mapping.storage.integrity_check import find_map_damage
+from topoloc.mapping.storage.kept_files import find_kept_files
 
 
 @dataclass

@@ -23,13 +23,13 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.config import VirtualNodesConfig
-from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
-from topoloc.mapping.topomap import NodeSummary, TopoMetricMap, TopoNode, VirtualNodes
-from topoloc.mapping.virtual_nodes import (
+from topoloc.mapping.node_drafts import (
     collect_virtual_nodes,
     create_virtual_nodes,
     select_virtual_view_nodes,
 )
+from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
+from topoloc.mapping.topomap import NodeSummary, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.retrieval.vlad import SurfVlad
 

@@ -11,8 +11,7 @@ import pytest
 import topoloc
 from tiny_recordings import HEIGHT, WIDTH, assert_slices, picture, pose
 from topoloc.errors import RecordingError
-from topoloc.recordings.frame import StereoSequence, sequence_subset
-from topoloc.recordings.frame_checks import find_image_problem
+from topoloc.recordings.frame import StereoSequence, find_image_problem, sequence_subset
 
 CAMERA = topoloc.Camera.pinhole(WIDTH, HEIGHT, 40.0, 41.0, 15.5, 11.5)
 RIG = topoloc.StereoRig.rectified(CAMERA, 0.12)

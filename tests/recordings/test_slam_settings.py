@@ -17,7 +17,7 @@ from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.calibration import parse_calibration
-from topoloc.recordings.camera_json import CameraCalibration
+from topoloc.recordings.camera_files import CameraCalibration
 from topoloc.recordings.open import open_sequence
 
 Read = Callable[[str], CameraCalibration]

@@ -18,10 +18,9 @@ from topoloc.mapping.config import MapConfig
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import read_image
 from topoloc.retrieval import descriptor_index
-from topoloc.retrieval.cell_grid import CellGrid
 from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
 from topoloc.retrieval.descriptor_kernels import max_shifted_products
-from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
+from topoloc.retrieval.vlad import CellGrid, SurfVlad, append_positions, learn_words, vlad
 
 NO_IMAGE = np.zeros((6, 8), np.uint8)
 ROWS, COLUMNS, CHANNELS = 4, 6, 16

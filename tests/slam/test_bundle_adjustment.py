@@ -7,7 +7,7 @@ import pytest
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.disparity import StereoCamera
+from topoloc.points.metric_points import StereoCamera
 from topoloc.slam.bundle.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations
 

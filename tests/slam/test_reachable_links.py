@@ -7,7 +7,7 @@ import pytest
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.points.disparity import StereoCamera
+from topoloc.points.metric_points import StereoCamera
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Observations
 from topoloc.slam.loop_closure import Link, is_reachable
 from topoloc.slam.place_matching import PlaceMatch

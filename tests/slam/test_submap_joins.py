@@ -14,7 +14,7 @@ import tiny_world
 from room_frames import RIG, FrameList, walk
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.points.disparity import measured_view
+from topoloc.points.metric_points import measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures

@@ -17,7 +17,7 @@ import torch
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, create_atlas
-from topoloc.mapping.storage.integrity_check import list_coarse_models
+from topoloc.mapping.storage.map_reading import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.backbones import Backbone
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import compute_variance_inflation
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
+from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin
 from topoloc.localization.evidence import (
     compute_translation_tolerance,

@@ -26,9 +26,8 @@ from typing import TYPE_CHECKING, Any
 from topoloc.atlas.config import AtlasConfig
 from topoloc.bounds import check_bounds
 from topoloc.errors import AtlasError
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.answer import ResultWithInliers
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights

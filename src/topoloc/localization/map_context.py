@@ -10,8 +10,7 @@ from msgspec import structs
 
 from topoloc.errors import WeightsError
 from topoloc.features.feature_types import check_available, select_stored_types
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
 from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement

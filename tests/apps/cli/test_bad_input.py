@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 
@@ -345,7 +346,7 @@ def test_bugs_are_not_hidden(room_map: Path, monkeypatch: pytest.MonkeyPatch):
         def bug(*_: object, kind: type[Exception] = kind) -> None:
             raise kind
 
-        monkeypatch.setattr("topoloc.mapping.storage.integrity_check.describe_map", bug)
+        monkeypatch.setattr(TopoMetricMap, "describe", bug)
         with pytest.raises(kind):
             main(["info", str(room_map)])
 

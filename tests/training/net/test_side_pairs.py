@@ -12,8 +12,7 @@ import pytest
 from built_corridor import WIDE, WalkAhead, back, corridor
 from tiny_world import render, smooth_texture
 from topoloc.errors import RecordingError
-from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.frame_checks import MemorySequence
+from topoloc.recordings.frame import MemorySequence, StereoFrame
 from topoloc_training.net.side_pairs import find_side_pairs
 from topoloc_training.net.slants import slanted
 

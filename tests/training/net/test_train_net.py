@@ -14,7 +14,7 @@ import torch
 
 from tiny_world import path_pose, render, room, write_stereo_recording
 from topoloc.features.network_files import NetworkInfo
-from topoloc.recordings.camera_json import read_camera_json
+from topoloc.recordings.camera_files import read_camera_json
 from topoloc_training.net import teacher as teaching, train as training
 from topoloc_training.net.network import TopolocNet
 from topoloc_training.net.pairs import Pair, find_pairs

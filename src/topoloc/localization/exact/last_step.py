@@ -17,10 +17,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from topoloc.geometry.absolute_pose import AbsolutePose, refine_absolute_pose
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import compute_variance_inflation
+from topoloc.geometry.camera import Camera, UncalibratedCamera
+from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.answer import Answer, Finding, lead
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.exact.patch_alignment import (

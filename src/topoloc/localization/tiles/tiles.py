@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from topoloc.errors import AtlasError, MapError
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.answer import (
     MIN_ALTERNATIVE_RATIO,
     LocalizationWithInliers,
