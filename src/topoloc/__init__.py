@@ -81,6 +81,7 @@ if TYPE_CHECKING:
         WeakRegions as WeakRegions,
         find_weak_regions as find_weak_regions,
     )
+    from topoloc.localization.answer import Finding as Finding
     from topoloc.localization.image_calibration_check import (
         check_camera_calibrations as check_camera_calibrations,
     )
@@ -169,6 +170,7 @@ _NAMES = {
     "topoloc.lifelong.tiles.tile_joining": "PairResult find_tile_of_recording join_tiles",
     "topoloc.lifelong.update": "MapUpdate update",
     "topoloc.lifelong.weak_regions": "NodeQuality WeakRegion WeakRegions find_weak_regions",
+    "topoloc.localization.answer": "Finding",
     "topoloc.localization.image_calibration_check": "check_camera_calibrations",
     "topoloc.localization.localizer": "Localizer LocalizerConfig",
     "topoloc.localization.map_facts.contradictions": "check_map",

@@ -22,7 +22,7 @@ from topoloc.geometry.rolling_shutter import TurningCamera, find_rotation
 from topoloc.localization.answer import Answer, Finding, probability_within
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import compute_normalized_uncertainty
-from topoloc.localization.exact.appearance import compare_floors
+from topoloc.localization.exact.appearance import check_colours
 from topoloc.localization.exact.last_step import look_again, refine_answer
 from topoloc.localization.image_calibration_check import check_image_calibration
 from topoloc.localization.map_query import MapQuery
@@ -137,7 +137,7 @@ CHECKS: tuple[Check, ...] = (
     look_again,
     check_camera,
     refine_answer,
-    compare_floors,
+    check_colours,
     check_threshold,
 )
 """All that may change an answer after the belief. `docs/architecture.md` describes each."""

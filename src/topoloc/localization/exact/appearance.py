@@ -154,7 +154,7 @@ def _correlate(
     return None if is_grey else ColourAgreement(float(correlation), light_change, contrast)
 
 
-def compare_floors(query: MapQuery, answer: Answer) -> Finding | None:
+def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
     """Compare the colours in view with those of the map. The probability includes that of another
     floor.
 
@@ -173,7 +173,7 @@ def compare_floors(query: MapQuery, answer: Answer) -> Finding | None:
         appearance = agreement.appearance(certainty, load_appearance_weights())
         text = f"the colours agree with this floor with a probability of {appearance:.2g}"
     share = share_of_this_floor(appearance, has_look_alikes)
-    return Finding("floors", text, share, {"appearance": appearance})
+    return Finding("colours", text, share, {"appearance": appearance})
 
 
 def share_of_this_floor(appearance: float | None, has_look_alikes: bool) -> float:
