@@ -1,4 +1,5 @@
-"""Run a part of `make acceptance`: old files, the figures of the demo, the rules of comparison."""
+"""Test parts of `make acceptance`: old files, the figures of the demo, and the rules
+of comparison."""
 
 from __future__ import annotations
 
@@ -94,7 +95,7 @@ def test_answers_that_differ_are_found(jobs: Any):
 
 
 def test_a_part_of_the_equality_is_as_before(jobs: Any, shared: Path):
-    """The cases name their commands; the files that they query are there."""
+    """Each case names its command, and the files that it queries exist."""
     sys.path.insert(0, str(SCRIPT.parent))
     try:
         equality = importlib.import_module("equality")

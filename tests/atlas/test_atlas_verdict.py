@@ -1,4 +1,4 @@
-"""The results of several tiles as one: the reported pose, the refusals, the probabilities."""
+"""Test the merge of several tiles' results: the reported pose, refusals and probabilities."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ Found = tuple[Tile, Localization | NotLocalized]
 
 
 def _merge(*found: Found, coarse: int = -1) -> Localization | NotLocalized:
-    """Merge the results of exhaustive searches; the one of this number was searched coarse only."""
+    """Merge the results of exhaustive searches. Tile number `coarse` was searched coarse only."""
     manifest = Manifest(tiles=tuple(tile for tile, _ in found))
     atlas = Atlas(FolderStore(Path("no-such-folder")), manifest)
     tiles = AtlasTiles(atlas, MapCache([], Localizer, 1), AtlasConfig(), lambda text: None)

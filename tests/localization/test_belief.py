@@ -1,5 +1,5 @@
-"""What is believed of several hypotheses of one image, and what is answered: one posterior,
-whatever came first."""
+"""Test the belief over several hypotheses of one image and its result, which do not
+depend on the order."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _answered(*hypotheses: Hypothesis) -> Localization | NotLocalized:
 
 
 def _along(result: Localization | NotLocalized) -> float:
-    """The metres along x of the pose that is answered."""
+    """Return x in metres of the reported pose."""
     assert isinstance(result, Localization)
     return float(result.world_from_cam.translation[0])
 
@@ -66,8 +66,7 @@ def test_poses_within_twice_what_is_tolerated_are_one():
 def test_poses_that_are_not_near_are_one_where_the_same_features_show_the_same_points(
     moved: float, expected: bool
 ):
-    """One of them is not precise yet; of two places that look alike, the same features show other
-    points."""
+    """One pose is not precise yet. At two similar places, the same features match other points."""
     features = made_features(len(POINTS))
     one = made_fit(0.0, POINTS, features)
     assert (
@@ -163,7 +162,7 @@ def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(
 def test_poses_that_lead_from_one_to_the_next_are_told_apart_in_the_same_way_in_any_order(
     order: tuple[int, ...],
 ):
-    """The middle one says the same as both ends, which say different things."""
+    """The middle pose equals both ends, and the ends differ."""
     chain = [made_hypothesis(3.0, x=0.0), made_hypothesis(2.0, x=0.4), made_hypothesis(1.0, x=0.8)]
     belief = believed([chain[k] for k in order]).belief
     assert [one.log_odds for one in belief.ranked(WEIGHTS.rivals)] == [3.0, 1.0]
@@ -230,7 +229,7 @@ def test_what_is_found_evenly_tells_two_poses_apart_that_have_the_same_odds():
 def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(
     log_odds: float, other: float, is_answered: bool
 ):
-    """What a wrong place of the map has for it, a place that is not in the map may have as well."""
+    """A place outside of the map may have as much evidence as a wrong place in the map."""
     best, wrong = (
         made_hypothesis(log_odds, even_share=0.2),
         made_hypothesis(other, x=9.0, even_share=0.02),
@@ -267,7 +266,7 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
 
 
 def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
-    """Each of their points was held against all other walls."""
+    """Each of their points was compared with all other virtual views."""
     strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
     for walls in (True, False):
         search = believed(

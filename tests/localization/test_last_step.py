@@ -1,4 +1,4 @@
-"""The last step makes a reported pose more exact, and leaves it alone if it cannot."""
+"""Test the last step: it makes a reported pose more exact, or leaves it unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The order of the proposals for one image, and when there are no more."""
+"""Test the order of the proposals for one image, and when they end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places by votes of single features, when the coarse localizer ranks others first."""
+"""Test places voted by single features, if the coarse localizer ranks other places first."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from topoloc.retrieval.coarse import Image, NodeScore
 
 @pytest.fixture(scope="module")
 def room(tiny_recording: Path) -> TopoMetricMap:
-    """Two rooms that are hardly alike."""
+    """Return a map of two rooms with few common points."""
     return twice(built_room(tiny_recording), share_alike=0.02)
 
 
 @pytest.fixture
 def any_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Votes are asked even if the retrieved nodes agree by chance."""
+    """Use votes even if the retrieved nodes agree by chance."""
     monkeypatch.setattr(LocalizerConfig, "num_chance_inliers", 0)
 
 
