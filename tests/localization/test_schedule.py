@@ -20,7 +20,7 @@ from topoloc.localization.map_query import MapQuery, verify_all
 from topoloc.localization.proposals import propose
 from topoloc.localization.proposals.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import Deadline, QueryImage, StageClock
-from topoloc.localization.refine import find_best_case_evidence
+from topoloc.localization.refine import find_best_case
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
@@ -97,11 +97,11 @@ def test_the_best_case_is_no_less_than_the_evidence_found(localizer: Localizer):
         (search,) = _searches(localizer, image)
         quick = propose_quick(search, min_rival_inliers(search))
         assert quick is not None
-        best, result = find_best_case_evidence(quick), localizer.localize(image, CAMERA)
+        best, result = find_best_case(quick), localizer.localize(image, CAMERA)
         assert isinstance(result, Localization)
         assert best is not None
         assert result.evidence is not None
-        assert weights.log_odds(best) >= weights.log_odds(result.evidence)
+        assert best.log_odds >= weights.log_odds(result.evidence)
 
 
 def test_an_image_of_another_place_has_no_quick_proposal(localizer: Localizer):

@@ -17,20 +17,24 @@ from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
-from topoloc.localization.belief import Hypothesis, log_odds_margin
+from topoloc.localization.belief import (
+    Hypothesis,
+    log_odds_margin,
+    select_probable,
+    share_probability,
+)
 from topoloc.localization.evidence import (
     compute_translation_tolerance,
     highest_probability,
     is_only_imprecise,
 )
 from topoloc.localization.image_calibration_check import find_focal_doubt
+from topoloc.localization.map_context import MapContext
 from topoloc.localization.map_facts.correlated_errors import shape_as_motion
 from topoloc.localization.pose_fit import PointMatches, PointObservations
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
-
-MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
 
 LocalizationWithInliers = tuple[Localization, PointObservations]
 """A pose and its inliers, in pixels of the original image."""
@@ -60,8 +64,8 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Hold the answer of one map: the result, each reported pose with its inliers, and the findings
-    of the checks so far.
+    """Hold the answer of one map: the result, each reported pose with its inliers and its
+    hypothesis, and the findings of the checks so far.
 
     `search` is that of the feature type that decided, and `best` its likeliest hypothesis.
     """
@@ -70,6 +74,7 @@ class Answer:
     best: Hypothesis | None
     result: Localization | NotLocalized
     poses: list[LocalizationWithInliers]
+    hypotheses: list[Hypothesis] = field(default_factory=list)
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -93,10 +98,27 @@ class Answer:
         else:
             pose, points = _build_localization(self.search, finding.hypothesis, probability)
         pose = replace(pose, **finding.facts)
-        if finding.refusal is None:
-            return Answer(self.search, best, pose, [(pose, points)], findings)
-        refusal = _refuse(self.search, pose, *finding.refusal)
-        return Answer(self.search, best, refusal, [], findings)
+        if finding.refusal is not None:
+            refusal = refuse(self.search, pose, *finding.refusal)
+            return Answer(self.search, best, refusal, [], [], findings)
+        hypotheses = [] if best is None else [best]
+        return Answer(self.search, best, pose, [(pose, points)], hypotheses, findings)
+
+    def with_provenance(self, opened: MapContext, camera: Camera | UncalibratedCamera) -> Answer:
+        """Return the answer with the identity of its map, the camera and the geoposes."""
+        poses = [(opened.with_provenance(pose, camera), seen) for pose, seen in self.poses]
+        return replace(self, result=opened.with_provenance(self.result, camera), poses=poses)
+
+    def margin_over(self, search: Search, rival: Hypothesis) -> float:
+        """Return the log-odds margin of the pose over a hypothesis of another map's search.
+
+        It separates similar places, if both are of one feature type. If not, it is the difference
+        of their log-odds.
+        """
+        best = self.hypotheses[0]
+        if self.search.map.kind.name != search.map.kind.name:
+            return best.log_odds - rival.log_odds
+        return log_odds_margin(best, rival, self.search.weights.rivals)
 
 
 def lead(search: Search) -> Answer:
@@ -108,8 +130,8 @@ def lead(search: Search) -> Answer:
         return Answer(search, best, _explain_not_localized(search, best), [])
     best = ranked[0]
     log_odds_margins = [_log_odds_margin(search, best, other) for other in ranked[1:]]
-    others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in log_odds_margins)
-    probability = best.evidence.precision_probability / (1.0 + others)
+    shares = share_probability(math.exp(-best.log_odds), log_odds_margins)
+    probability = best.evidence.precision_probability * shares[0]
     is_leading = all(
         by >= (rivals.unclear_lead if _is_unclear_and_distant(search, best, other) else rivals.lead)
         for by, other in zip(log_odds_margins, ranked[1:], strict=True)
@@ -118,7 +140,7 @@ def lead(search: Search) -> Answer:
         pose, points = _build_localization(search, best, probability)
         if pose.probability >= min_probability:
             return _weigh_camera(search, best, pose, points)
-    return _ambiguous_answer(search, ranked, log_odds_margins, others)
+    return _ambiguous_answer(search, ranked, shares)
 
 
 def _weigh_camera(
@@ -138,7 +160,7 @@ def _weigh_camera(
             detail = f"{detail}: state --camera"
             refusal = _build_not_localized(search, "too_few_inliers", best.fit, detail)
             return Answer(search, best, refusal, [])
-    return Answer(search, best, pose, [(pose, points)])
+    return Answer(search, best, pose, [(pose, points)], [best])
 
 
 def probability_within(search: Search, best: Hypothesis, camera: CameraBelief) -> float:
@@ -210,21 +232,10 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     return replace(best, covariance=total, noise_share=float(share))
 
 
-def _ambiguous_answer(
-    search: Search, ranked: list[Hypothesis], log_odds_margins: list[float], others: float
-) -> Answer:
+def _ambiguous_answer(search: Search, ranked: list[Hypothesis], shares: list[float]) -> Answer:
     """Return an ambiguous answer with the probability of each alternative."""
-    best = ranked[0]
-    shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in log_odds_margins)]
-    probable = [
-        pair
-        for pair in zip(ranked, shares, strict=True)
-        if pair[1] >= MIN_ALTERNATIVE_RATIO * shares[0]
-    ]
-    named = [
-        _build_localization(search, one, share)
-        for one, share in sorted(probable, key=lambda pair: -pair[1])
-    ]
+    best, probable = ranked[0], select_probable(ranked, shares)
+    named = [_build_localization(search, one, share) for one, share in probable]
     alternatives = tuple(
         Alternative(one.world_from_cam, one.probability, one.node_id) for one, _ in named
     )
@@ -234,7 +245,7 @@ def _ambiguous_answer(
         reason = "ambiguous"
         detail = f"as much like node {second.node_id} as like node {first.node_id}"
     refusal = _build_not_localized(search, reason, best.fit, detail, alternatives)
-    return Answer(search, best, refusal, named)
+    return Answer(search, best, refusal, named, [one for one, _ in probable])
 
 
 def _explain_not_localized(search: Search, best: Hypothesis | None) -> NotLocalized:
@@ -275,7 +286,7 @@ def _build_not_localized(
     )
 
 
-def _refuse(search: Search, pose: Localization, reason: Reason, detail: str) -> NotLocalized:
+def refuse(search: Search, pose: Localization, reason: Reason, detail: str) -> NotLocalized:
     """Return the refusal of a pose."""
     return replace(
         _build_not_localized(search, reason, None, detail),

@@ -159,8 +159,8 @@ def fit_around(
         return fit_pose(*matched, config.pose, start, min_matches, search.correlated_error_share)
 
 
-def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:
-    """Return the evidence of the refined proposal if all unguided matches agreed with it.
+def find_best_case(proposal: NodeProposal) -> Hypothesis | None:
+    """Return the refined proposal as a hypothesis with which all unguided matches agree.
 
     None if too few points were found.
     """
@@ -168,8 +168,10 @@ def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:
     if not isinstance(final, PoseFit) or final.num_inliers < search.config.evidence.min_found:
         return None
     with search.query.clock.stage("evidence"):
-        inflated = 1.0 + final.num_inliers * search.correlated_error_share
-        return compute_best_case_evidence(search, final, final.pose.inflated(inflated))
+        covariance = final.pose.inflated(1.0 + final.num_inliers * search.correlated_error_share)
+        evidence = compute_best_case_evidence(search, final, covariance)
+    log_odds = search.weights.log_odds(evidence)
+    return Hypothesis(proposal.source, final, evidence, covariance, 1.0, log_odds)
 
 
 def confirm_hypotheses(first: Search, last: Search) -> Answer:

@@ -15,19 +15,19 @@ from topoloc.atlas.config import AtlasConfig
 from topoloc.errors import MapError, ObjectStoreError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import ResultWithInliers
+from topoloc.localization.belief import MIN_ALTERNATIVE_RATIO
 from topoloc.localization.checks import decide, decide_coarsely
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.proposals.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import Deadline, QueryImage, StageClock
-from topoloc.localization.refine import find_best_case_evidence
+from topoloc.localization.refine import find_best_case
 from topoloc.localization.search import Trace
 from topoloc.localization.tiles.tiles import (
     Reach,
+    TileAnswer,
     TileRanking,
-    TileResult,
     Tiles,
-    is_negligible_rival,
-    merge_tile_results,
+    merge_answers,
     ranking_margin,
 )
 
@@ -48,7 +48,7 @@ class Schedule:
     trace: Trace | None = None
     clock: StageClock = field(default_factory=StageClock)
     ranking: TileRanking = field(default_factory=list)
-    results: dict[str, TileResult] = field(default_factory=dict)
+    answers: dict[str, TileAnswer] = field(default_factory=dict)
     queries: dict[str, MapQuery] = field(default_factory=dict)
 
     def search_all(self) -> None:
@@ -64,13 +64,13 @@ class Schedule:
         for number in range(self.config.num_asked):
             # after the first one, a tile must have a coarse pose or be similar, or cannot be ranked
             least = (0.0, self.config.min_similarity) if number else (0.0, -math.inf)
-            searched = {one.tile_id for one in self.results.values() if one.is_exhaustive}
+            searched = {one.tile_id for one in self.answers.values() if one.is_exhaustive}
             left = [one for one in self._readable(hopeful) if one[0] not in searched]
             left = [one for one in left if self._priority(one) >= least or self._is_unranked(one)]
-            if not left or self._localized or (self.results and self.deadline.is_past):
+            if not left or self._localized or (self.answers and self.deadline.is_past):
                 break
             self.search_tile(*max(left, key=self._priority))
-        while not self.results and (left := self._readable(self.ranking)):
+        while not self.answers and (left := self._readable(self.ranking)):
             self.search_tile(*left[0])  # the likely tiles cannot be read
         if self._localized:
             self._search_similar_tiles()
@@ -82,17 +82,17 @@ class Schedule:
         for tile_id, similarity in self._candidates()[:num_tiles]:
             if self._has_clear_pose or self.deadline.is_past:
                 return
-            if tile_id not in self.results:
+            if tile_id not in self.answers:
                 self.search_tile(tile_id, similarity, is_exhaustive=False)
 
     def _search_similar_tiles(self) -> None:
         """Search tiles that are about as similar to the image as the localized one."""
         least = min(one.similarity for one in self._localized) - self.config.max_rival_gap
-        alike = [one for one in self.ranking if one[1] >= least and one[0] not in self.results]
+        alike = [one for one in self.ranking if one[1] >= least and one[0] not in self.answers]
         for tile_id, similarity in alike[: self.config.num_rivals]:
             if not self.deadline.is_past:
                 self.search_tile(tile_id, similarity, is_exhaustive=False, only_rival=True)
-        for one in list(self.results.values()):
+        for one in list(self.answers.values()):
             if one.is_clear and not one.is_exhaustive:  # one of them may hold the true pose
                 self.search_tile(one.tile_id, one.similarity)
 
@@ -114,7 +114,7 @@ class Schedule:
             MapError: the map cannot be read, and no other tile is left.
         """
         if not self.tiles.can_search(tile_id):
-            self.results.pop(tile_id, None)
+            self.answers.pop(tile_id, None)
             return
         if prior is None and self.reach is not None:
             prior = self.reach.get(tile_id)
@@ -128,20 +128,18 @@ class Schedule:
                 if only_rival and not self._may_be_rival(query):
                     return
                 answer = decide(query) if is_exhaustive else decide_coarsely(query)
-                camera = self.query_image.camera
-                result = opened.with_provenance(answer.result, camera)
-                poses = [(opened.with_provenance(one, camera), seen) for one, seen in answer.poses]
+                answer = answer.with_provenance(opened, self.query_image.camera)
         except ObjectStoreError:  # the tile is fine, but its result is unknown
             raise
         except MapError as error:
-            self.results.pop(tile_id, None)
+            self.answers.pop(tile_id, None)
             self.tiles.report(tile_id, error)
             return
-        self.results[tile_id] = TileResult(tile_id, result, poses, is_exhaustive, similarity)
+        self.answers[tile_id] = TileAnswer(tile_id, answer, is_exhaustive, similarity)
 
     def outcome(self) -> ResultWithInliers:
         """Return the result of all searched tiles. Raises AtlasError: there are none."""
-        result, poses = merge_tile_results(self.tiles, list(self.results.values()))
+        result, poses = merge_answers(self.tiles, list(self.answers.values()))
         return replace(result, times_ms=self.clock.times_ms()), poses
 
     def _candidates(self) -> TileRanking:
@@ -164,10 +162,10 @@ class Schedule:
         search, known = query.searches[0], self._localized
         least = min(min_rival_inliers(self.queries[one.tile_id].searches[0]) for one in known)
         quick = propose_quick(replace(search), least)
-        evidence = None if quick is None else find_best_case_evidence(quick)
-        poses = [one.localized for one in known if one.localized is not None]
-        return evidence is not None and not all(
-            is_negligible_rival(evidence, search.map.kind.name, pose) for pose in poses
+        rival = None if quick is None else find_best_case(quick)
+        negligible = -math.log(MIN_ALTERNATIVE_RATIO)
+        return rival is not None and any(
+            one.answer.margin_over(search, rival) <= negligible for one in known
         )
 
     def _readable(self, ranking: TileRanking) -> TileRanking:
@@ -176,15 +174,15 @@ class Schedule:
 
     def _priority(self, ranked: tuple[str, float]) -> tuple[float, float]:
         """Return the sort key of a tile: the probability of its coarse pose, its similarity."""
-        known = self.results.get(ranked[0])
-        found = [one.probability for one, _ in known.poses] if known else []
+        known = self.answers.get(ranked[0])
+        found = [one.probability for one, _ in known.answer.poses] if known else []
         return max(found, default=0.0), ranked[1]
 
     @property
-    def _localized(self) -> list[TileResult]:
+    def _localized(self) -> list[TileAnswer]:
         """Return the tiles that localized the image in an exhaustive search."""
-        return [one for one in self.results.values() if one.localized is not None]
+        return [one for one in self.answers.values() if one.localized is not None]
 
     @property
     def _has_clear_pose(self) -> bool:
-        return any(one.is_clear for one in self.results.values())
+        return any(one.is_clear for one in self.answers.values())
