@@ -56,6 +56,7 @@ def test_verdicts(jobs: Any):
     assert [verdict("at most", 1, now) for now in (2, 1, 0)] == ["worse", "same", "better"]
     assert [verdict("median", 1.0, now) for now in (1.06, 1.04, 0.9)] == ["worse", "same", "better"]
     assert [verdict("time", 1.0, now) for now in (1.3, 1.1, 0.7)] == ["worse", "same", "better"]
+    assert [verdict("budget", 100, now) for now in (104, 103, 96)] == ["worse", "same", "better"]
     assert [verdict("equal", "a", now) for now in ("a", "b")] == ["same", "worse"]
 
 
