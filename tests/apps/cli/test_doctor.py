@@ -147,7 +147,8 @@ def test_without_a_place_for_compiled_code_it_names_the_variable(
     capsys: pytest.CaptureFixture[str],
 ):
     (tmp_path / "file").write_text("no folder")
-    monkeypatch.setattr("topoloc.plugin.kernel_caches", lambda: [tmp_path / "file" / "below"])
+    below = [tmp_path / "file" / "below"]
+    monkeypatch.setattr("topoloc.apps.core_names.kernel_caches", lambda: below)
     assert main(["doctor"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert f"{tmp_path / 'file' / 'below'} cannot be written; NUMBA_CACHE_DIR names" in line

@@ -22,7 +22,7 @@ from topoloc import (
     TriedProposal,
     UncalibratedCamera,
 )
-from topoloc.plugin import Deadline
+from topoloc.apps.core_names import Deadline
 
 _MIN_FEATURES, _MIN_PROBABILITY = 150, 0.5
 _DARKER, _BRIGHTER = 0.6, 1.7  # times the light of the nearest session

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from topoloc import Finding, Image, Localization, TopoMetricMap
+from topoloc.apps.core_names import encode_jpeg
 from topoloc.apps.report.explanation import EvaluatedPose, Explanation
 from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, draw_pair, read_template
 from topoloc.apps.report.page_template import (
@@ -17,7 +18,6 @@ from topoloc.apps.report.page_template import (
     render_section,
     render_table,
 )
-from topoloc.plugin import encode_jpeg
 
 _POSES_TEXT = (
     "Each row is a pose proposal. Found counts the map points that were found again, of all that"

@@ -27,10 +27,11 @@ from topoloc.apps.cli.features_option import (
 )
 from topoloc.apps.cli.output import File, UsageError, check_outputs, option, print_line, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
+from topoloc.apps.core_names import as_monocular
 from topoloc.apps.query_camera import select_frame_camera
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
 from topoloc.apps.report.explanation_page import check_row, explanation_page, row_of, verdict
-from topoloc.plugin import as_monocular, write_text
+from topoloc.plugin import write_text
 
 
 @dataclass(frozen=True)
