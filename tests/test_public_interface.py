@@ -1,23 +1,28 @@
-"""The public names do the work of the commands, from paths."""
+"""Check that the public names do the work of the commands, given paths."""
 
 from __future__ import annotations
 
+import ast
 import builtins
 import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 import topoloc
 import topoloc.plugin
 from topoloc import errors
+from topoloc.apps import core_names
 from topoloc.demo.recordings import SHIPPED
+
+CORE_NAMES = Path(core_names.__file__).with_suffix(".pyi")
 
 
 def _docstrings() -> Iterator[tuple[str, str]]:
-    for door in (topoloc, topoloc.plugin):
+    for door in (topoloc, topoloc.plugin, core_names):
         for name in door.__all__:
             public = getattr(door, name)
             yield name, inspect.getdoc(public) or ""
@@ -28,7 +33,7 @@ def _docstrings() -> Iterator[tuple[str, str]]:
 
 
 def test_errors_that_public_names_raise_are_of_the_documented_tree():
-    """Or Python's own. The tree is on the page of the public names."""
+    """Python's own errors are allowed, too. The page of the public names shows the tree."""
     raised = {
         error: name
         for name, text in _docstrings()
@@ -38,6 +43,43 @@ def test_errors_that_public_names_raise_are_of_the_documented_tree():
     own = {error for error in raised if not hasattr(builtins, error)}
     assert [(raised[error], error) for error in own if not hasattr(errors, error)] == []
     assert own <= set(re.findall(r"\w+Error", errors.__doc__ or ""))
+
+
+def test_extensions_are_promised_few_names():
+    assert 30 < len(topoloc.plugin.__all__) <= 40
+
+
+@pytest.mark.parametrize("door", [topoloc, topoloc.plugin, core_names], ids=lambda m: m.__name__)
+def test_the_names_of_a_stub_are_those_of_its_module(door: ModuleType):
+    stub = Path(door.__file__ or "").with_suffix(".pyi").read_text(encoding="utf-8")
+    listed = set(re.findall(r"\b(\w+) as \1\b", stub)) | set(re.findall(r"^(__v\w+):", stub, re.M))
+    assert listed == set(door.__all__)
+    for name in door.__all__:
+        assert getattr(door, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'nowhere'"):
+        _ = door.nowhere
+
+
+def test_applications_use_each_name_that_is_theirs_alone():
+    """And no name of it is public, too."""
+    apps = CORE_NAMES.parent.rglob("*.py")
+    used = {
+        name
+        for path in apps
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for name in _names_of_core(node)
+    }
+    assert used == set(core_names.__all__)
+    assert used & {*topoloc.__all__, *topoloc.plugin.__all__} == set()
+
+
+def _names_of_core(node: ast.AST) -> list[str]:
+    """Return the names of `core_names` that a statement imports or an expression reads."""
+    if isinstance(node, ast.ImportFrom) and node.module == "topoloc.apps.core_names":
+        return [alias.name for alias in node.names]
+    if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "core_names":
+        return [node.attr]
+    return []
 
 
 @pytest.mark.parametrize(

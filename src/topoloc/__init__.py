@@ -1,195 +1,49 @@
 """topoloc: a place mapped once with a stereo or RGB-D camera; afterwards any single image of it
 gets a metric 6-DoF pose.
 
-The public names; each loads its module when it is first asked for, so that `import topoloc` costs
-nothing.
+`__init__.pyi` lists the public names. Each one loads its module at its first use, so that
+`import topoloc` costs nothing.
 """
 
 from __future__ import annotations
 
+import ast
 import importlib
-from typing import TYPE_CHECKING, Any
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
 
-if TYPE_CHECKING:
-    from topoloc.apps.export.formats import export as export
-    from topoloc.apps.report.explanation import explain as explain
-    from topoloc.apps.service.client import AsyncClient as AsyncClient, Client as Client
-    from topoloc.apps.viewer.page import view as view
-    from topoloc.atlas.atlas import Atlas as Atlas
-    from topoloc.atlas.config import AtlasConfig as AtlasConfig
-    from topoloc.atlas.location_prior import GeoPositionPrior as GeoPositionPrior
-    from topoloc.atlas.manifest import Tile as Tile
-    from topoloc.atlas.map_cache import MapCache as MapCache
-    from topoloc.atlas.place import (
-        SharedWorld as SharedWorld,
-        SingleMap as SingleMap,
-        open_place as open_place,
-    )
-    from topoloc.compiled import set_num_threads as set_num_threads
-    from topoloc.errors import (
-        AtlasError as AtlasError,
-        CalibrationError as CalibrationError,
-        ClusterError as ClusterError,
-        ConfigError as ConfigError,
-        DuplicateSessionError as DuplicateSessionError,
-        FeatureTypeError as FeatureTypeError,
-        GeoreferenceError as GeoreferenceError,
-        MapError as MapError,
-        MapNotFoundError as MapNotFoundError,
-        MissingExtraError as MissingExtraError,
-        ObjectStoreError as ObjectStoreError,
-        QueryError as QueryError,
-        RecordingError as RecordingError,
-        ResultError as ResultError,
-        ServiceError as ServiceError,
-        TopolocError as TopolocError,
-        TrajectoryError as TrajectoryError,
-        UnreadableImageError as UnreadableImageError,
-        WeightsError as WeightsError,
-    )
-    from topoloc.evaluation.certification import Certification as Certification, certify as certify
-    from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery, WorldFit as WorldFit
-    from topoloc.evaluation.query_localization import (
-        Evaluation as Evaluation,
-        evaluate as evaluate,
-        find_frames_with_truth as find_frames_with_truth,
-        localize_out_of_map as localize_out_of_map,
-        localize_queries as localize_queries,
-    )
-    from topoloc.geometry.camera import Camera as Camera, UncalibratedCamera as UncalibratedCamera
-    from topoloc.geometry.geodesy import (
-        GeoPoint as GeoPoint,
-        GeoPose as GeoPose,
-        Georeference as Georeference,
-    )
-    from topoloc.geometry.pose_conventions import PoseConventions as PoseConventions
-    from topoloc.geometry.rig import StereoRig as StereoRig
-    from topoloc.geometry.rigid import Rigid3 as Rigid3
-    from topoloc.lifelong.growing import GrowingMap as GrowingMap, Growth as Growth
-    from topoloc.lifelong.merge import merge as merge, move_map as move_map
-    from topoloc.lifelong.prune import prune as prune
-    from topoloc.lifelong.tiles.tile_joining import (
-        PairResult as PairResult,
-        find_tile_of_recording as find_tile_of_recording,
-        join_tiles as join_tiles,
-    )
-    from topoloc.lifelong.update import MapUpdate as MapUpdate, update as update
-    from topoloc.lifelong.weak_regions import (
-        NodeQuality as NodeQuality,
-        WeakRegion as WeakRegion,
-        WeakRegions as WeakRegions,
-        find_weak_regions as find_weak_regions,
-    )
-    from topoloc.localization.image_calibration_check import (
-        check_camera_calibrations as check_camera_calibrations,
-    )
-    from topoloc.localization.localizer import (
-        Localizer as Localizer,
-        LocalizerConfig as LocalizerConfig,
-    )
-    from topoloc.localization.map_facts.contradictions import check_map as check_map
-    from topoloc.localization.map_facts.map_building import build_map as build_map
-    from topoloc.localization.provenance import Provenance as Provenance
-    from topoloc.localization.result import (
-        Alternative as Alternative,
-        Localization as Localization,
-        NotLocalized as NotLocalized,
-        result_from_json as result_from_json,
-    )
-    from topoloc.localization.search import Trace as Trace, TriedProposal as TriedProposal
-    from topoloc.mapping.build import BuildConfig as BuildConfig
-    from topoloc.mapping.edit import read_history as read_history, undo_edit as undo_edit
-    from topoloc.mapping.georeference import (
-        GeoreferenceResult as GeoreferenceResult,
-        georeference as georeference,
-    )
-    from topoloc.mapping.storage.entries import Illumination as Illumination, TopoNode as TopoNode
-    from topoloc.mapping.topomap import TopoMetricMap as TopoMetricMap
-    from topoloc.recordings.frame import (
-        DepthImage as DepthImage,
-        Image as Image,
-        MemorySequence as MemorySequence,
-        StereoFrame as StereoFrame,
-        StereoSequence as StereoSequence,
-    )
-    from topoloc.recordings.image_io import read_depth as read_depth, read_image as read_image
-    from topoloc.recordings.open import open_sequence as open_sequence
-    from topoloc.recordings.trajectory import (
-        Trajectory as Trajectory,
-        align_to_trajectory as align_to_trajectory,
-        with_pose_conventions as with_pose_conventions,
-        with_trajectory as with_trajectory,
-    )
-    from topoloc.slam.slam import SlamResult as SlamResult, run_slam as run_slam
-    from topoloc.tracking.config import TrackerConfig as TrackerConfig
-    from topoloc.tracking.shared_cameras import SharedCameras as SharedCameras
-    from topoloc.tracking.stream_result import StreamedPose as StreamedPose
-    from topoloc.tracking.tracker import Tracker as Tracker
-    from topoloc.tracking.warm_up import warm_up as warm_up
 
-    __version__: str
+def attach_stub(
+    module: str, file: str
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a module: the names that its stub imports.
 
-_NAMES = {
-    "topoloc.apps.export.formats": "export",
-    "topoloc.apps.report.explanation": "explain",
-    "topoloc.apps.service.client": "AsyncClient Client",
-    "topoloc.apps.viewer.page": "view",
-    "topoloc.atlas.atlas": "Atlas",
-    "topoloc.atlas.config": "AtlasConfig",
-    "topoloc.atlas.location_prior": "GeoPositionPrior",
-    "topoloc.atlas.manifest": "Tile",
-    "topoloc.atlas.map_cache": "MapCache",
-    "topoloc.atlas.place": "SharedWorld SingleMap open_place",
-    "topoloc.compiled": "set_num_threads",
-    "topoloc.errors": (
-        "AtlasError CalibrationError ClusterError ConfigError DuplicateSessionError "
-        "FeatureTypeError GeoreferenceError MapError MapNotFoundError MissingExtraError "
-        "ObjectStoreError QueryError RecordingError ResultError ServiceError TopolocError "
-        "TrajectoryError UnreadableImageError WeightsError"
-    ),
-    "topoloc.evaluation.certification": "Certification certify",
-    "topoloc.evaluation.metrics": "EvaluatedQuery WorldFit",
-    "topoloc.evaluation.query_localization": (
-        "Evaluation evaluate find_frames_with_truth localize_out_of_map localize_queries"
-    ),
-    "topoloc.geometry.camera": "Camera UncalibratedCamera",
-    "topoloc.geometry.geodesy": "GeoPoint GeoPose Georeference",
-    "topoloc.geometry.pose_conventions": "PoseConventions",
-    "topoloc.geometry.rig": "StereoRig",
-    "topoloc.geometry.rigid": "Rigid3",
-    "topoloc.lifelong.growing": "GrowingMap Growth",
-    "topoloc.lifelong.merge": "merge move_map",
-    "topoloc.lifelong.prune": "prune",
-    "topoloc.lifelong.tiles.tile_joining": "PairResult find_tile_of_recording join_tiles",
-    "topoloc.lifelong.update": "MapUpdate update",
-    "topoloc.lifelong.weak_regions": "NodeQuality WeakRegion WeakRegions find_weak_regions",
-    "topoloc.localization.image_calibration_check": "check_camera_calibrations",
-    "topoloc.localization.localizer": "Localizer LocalizerConfig",
-    "topoloc.localization.map_facts.contradictions": "check_map",
-    "topoloc.localization.map_facts.map_building": "build_map",
-    "topoloc.localization.provenance": "Provenance",
-    "topoloc.localization.result": "Alternative Localization NotLocalized result_from_json",
-    "topoloc.localization.search": "Trace TriedProposal",
-    "topoloc.tracking.shared_cameras": "SharedCameras",
-    "topoloc.mapping.build": "BuildConfig",
-    "topoloc.mapping.edit": "read_history undo_edit",
-    "topoloc.mapping.georeference": "GeoreferenceResult georeference",
-    "topoloc.mapping.storage.entries": "Illumination TopoNode",
-    "topoloc.mapping.topomap": "TopoMetricMap",
-    "topoloc.recordings.frame": "DepthImage Image MemorySequence StereoFrame StereoSequence",
-    "topoloc.recordings.image_io": "read_depth read_image",
-    "topoloc.recordings.open": "open_sequence",
-    "topoloc.recordings.trajectory": (
-        "Trajectory align_to_trajectory with_pose_conventions with_trajectory"
-    ),
-    "topoloc.slam.slam": "SlamResult run_slam",
-    "topoloc.tracking.config": "TrackerConfig",
-    "topoloc.tracking.stream_result": "StreamedPose",
-    "topoloc.tracking.tracker": "Tracker",
-    "topoloc.tracking.warm_up": "warm_up",
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-__all__ = sorted([*_MODULES, "__version__"])
+    `file` is the file of the module. The stub is the .pyi file beside it, which type checkers and
+    editors read, too."""
+    with open(os.path.splitext(file)[0] + ".pyi", encoding="utf-8") as stub:
+        tree = ast.parse(stub.read())
+    sources = {
+        alias.name: node.module
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("topoloc.")
+        for alias in node.names
+    }
+    names = sorted(sources)
+
+    def load(name: str) -> Any:
+        if name not in sources:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(sources[name]), name)
+        setattr(sys.modules[module], name, value)
+        return value
+
+    return load, lambda: list(names), names
+
+
+_load, __dir__, __all__ = attach_stub(__name__, __file__)
+__all__ += ["__version__"]
 
 
 def __getattr__(name: str) -> Any:
@@ -197,11 +51,4 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("topoloc")
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(_MODULES[name]), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return list(__all__)
+    return _load(name)

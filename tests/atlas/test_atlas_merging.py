@@ -1,5 +1,5 @@
-"""`topoloc merge` of atlases: every tile as it was, worlds and joins their own, and nothing where
-two tiles are taken for one."""
+"""Test `topoloc merge` of atlases: tiles, worlds and joins stay as they were, and a conflict of two
+tiles changes nothing."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`topoloc update ATLAS`: recordings join the tiles that they are of, as they would join the tile's
-map file; nobody is overwritten."""
+"""Test `topoloc update ATLAS`: recordings update their tiles exactly as a map file, and parallel
+changes are kept."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Complaint = Callable[..., str]
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Recordings of both rooms of the atlas, and of a third one."""
+    """Return recordings of both rooms of the atlas, and of a third room."""
     folder = tmp_path_factory.mktemp("sessions")
     rows = {
         "evening": (0, np.arange(0.25, 5.5, 0.25)),
@@ -66,7 +66,7 @@ def _map(where: object, tile_id: str) -> bytes:
 
 
 def _note(path: Path, text: str) -> None:
-    """An edit that changes a map's history alone."""
+    """Edit only the history of a map."""
     with edit_map(path) as edit:
         edit.commit(edit.topomap, text)
 
@@ -110,7 +110,7 @@ def test_each_recording_joins_its_tile_as_it_would_join_the_map(
 def test_a_tile_that_is_named_is_not_sought(
     own_atlas: Path, sessions: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ):
-    """What is of another one does not fit it; the others go on."""
+    """A recording of another tile does not fit the named one. The other recordings continue."""
     before = _map(own_atlas, "room")
     updated = _updated(
         capsys, 1, own_atlas, sessions["evening"], sessions["night"], "--tile", "other"

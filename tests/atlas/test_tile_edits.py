@@ -1,5 +1,5 @@
-"""Commands that edit a map edit the tile of an atlas as they do a map file, and `undo` takes it
-back to the byte."""
+"""Check that edit commands change a tile of an atlas like a map file, and that `undo` restores it
+byte-identical."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Depths of single images from the landmarks of a map, compared with those of the stereo pair."""
+"""Compare depths of single images, taken from landmarks of a map, with depths of
+the stereo pair."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Which query images are reduced before they are looked at, and how far; what is known of them
-when."""
+"""Test the reduction of query images, and the time at which their properties are computed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Edits of a map file: all or nothing, with a history, one at a time, taken back to the byte."""
+"""Test edits of a map file: all or nothing, with a history, one at a time, and
+byte-identical after undo."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ def _names(path: Path) -> list[str]:
 
 
 def _without_a_node(path: Path, changes: dict | None = None) -> None:
-    """A node with all that is of it goes, another one's template changes."""
+    """Remove a node and its data, and change the template of another."""
     with edit_map(path) as edit:
         topomap, gone = edit.topomap, edit.topomap.summaries[-1].node_id
         first, *rest = list(topomap.nodes)[:-1]
@@ -165,7 +166,8 @@ def test_a_damaged_kept_file_is_refused(map_file: Path, seed: int):
 
 
 def test_an_edit_reads_one_of_the_older_kept_files(map_file: Path, monkeypatch: pytest.MonkeyPatch):
-    """All together may have 1 GB. `history` reads all; `undo` reads the one that it restores."""
+    """All kept files together may have 1 GB. `history` reads all of them, and `undo` reads only
+    the restored one."""
     for _ in range(4):
         _without_a_node(map_file)
     kept, read = find_kept_files(map_file), list[Path]()

@@ -1,4 +1,5 @@
-"""Maps of older schemas open, answer as they always did, and are saved as those of today."""
+"""Check that maps of older schemas open, give the same results, and are saved in the
+current schema."""
 
 from __future__ import annotations
 

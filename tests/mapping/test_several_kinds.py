@@ -1,5 +1,5 @@
-"""A map of several kinds of features: what goes in comes out, and it can be taken for a map of each
-of them."""
+"""Test a map of several feature types: its content is read back, and each type can
+be used alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Disparities of the rendered room against its exact depth."""
+"""Compare disparities of the rendered room with its exact depth."""
 
 from __future__ import annotations
 

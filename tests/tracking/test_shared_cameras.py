@@ -1,4 +1,4 @@
-"""What several images show of their camera together."""
+"""Test the camera parameters that several images estimate together."""
 
 from __future__ import annotations
 

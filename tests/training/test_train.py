@@ -1,5 +1,5 @@
-"""`topoloc train`: a map gets a learned coarse localizer and is asked through it; what fails is
-said in one line."""
+"""Test `topoloc train`: a map gets a learned coarse localizer and uses it, and
+errors are one line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small(tmp_path: Path) -> tuple[str, ...]:
-    """Small pictures and one epoch."""
+    """Return settings for small images and one epoch."""
     path = tmp_path / "small.toml"
     path.write_text(SETTINGS)
     return ("--config", str(path))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from topoloc import Camera, QueryError, StereoFrame, TopoMetricMap, UncalibratedCamera
-from topoloc.plugin import parse_calibration
+from topoloc.apps.core_names import parse_calibration
 
 CameraOfSize = Callable[[int, int], Camera | UncalibratedCamera]
 """A function from image width and height to a camera model."""

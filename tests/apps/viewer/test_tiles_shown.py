@@ -1,5 +1,5 @@
-"""Tiles of an atlas that share a world, shown and exported together: each where the atlas knows it
-to lie."""
+"""Test the display and export of an atlas's tiles that share a world, each at its
+place in the atlas."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Walls seen from both ends, as `topoloc-net-sides` learns them: pairs of rendered ways, and
-pictures hung on a wall."""
+"""Test the pairs of walls seen from both ends that train `topoloc-net-sides`: rendered routes, and
+images on a wall."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Training of our own network, as small as can be: it learns, goes on where it was stopped, and
-leaves a network of the contract."""
+"""Train a minimal version of topoloc's own network: it learns, resumes, and exports a
+valid network."""
 
 from __future__ import annotations
 

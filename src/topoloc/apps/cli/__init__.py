@@ -140,7 +140,7 @@ def _dispatch(args: list[str]) -> int:
     if name in PLUGIN_PACKAGES:
         _print_error(f"`topoloc {name}` needs {PLUGIN_PACKAGES[name]}, which is not installed")
     else:
-        from topoloc.plugin import suggest_name
+        from topoloc.apps.core_names import suggest_name
 
         hint = suggest_name(name, commands) or f"; commands: {', '.join(commands)}"
         _print_error(f"unknown command {name!r}{hint}")
@@ -178,7 +178,7 @@ def _warn_broken_plugin(module: str, error: Exception) -> None:
 
 def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
     from topoloc import TopolocError
-    from topoloc.plugin import collect_written_paths
+    from topoloc.apps.core_names import collect_written_paths
 
     written = collect_written_paths()
     try:

@@ -16,6 +16,7 @@ from typing import Any
 
 import topoloc
 from topoloc import plugin
+from topoloc.apps import core_names
 from topoloc.apps.cli import PLUGIN_PACKAGES
 from topoloc.apps.cli.output import (
     File,
@@ -102,7 +103,7 @@ def _examine_extras() -> Found:
 
 def _examine_caches() -> Found:
     """Return the folders of fetched networks and of compiled code."""
-    networks, *kernels = plugin.cache_folder(), *plugin.kernel_caches()
+    networks, *kernels = plugin.cache_folder(), *core_names.kernel_caches()
     facts = {
         "networks": [_describe_folder(networks, "*")],
         "kernels": [_describe_folder(folder, "**/*.nb?") for folder in kernels],
@@ -116,7 +117,7 @@ def _examine_caches() -> Found:
 def _examine_networks() -> Found:
     """Run each network that is here on a small picture."""
     facts, faults = dict[str, Any](), list[str]()
-    for network in plugin.NetworkInfo.known():
+    for network in core_names.NetworkInfo.known():
         try:
             path = network.find_file()
         except topoloc.WeightsError as missing:
@@ -127,7 +128,7 @@ def _examine_networks() -> Found:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         facts[network.name] = {"path": str(path), "sha256": digest}
         try:
-            plugin.NetworkInfo.of_file(path)
+            core_names.NetworkInfo.of_file(path)
         except topoloc.WeightsError as error:
             remedy = f"remove it; {network.install_hint}" if network.file else _REINSTALL
             faults.append(f"{error}; {remedy}")
@@ -141,7 +142,7 @@ def _examine_pipeline() -> Found:
     wait = "compiling, once: about a minute ..."
     topoloc.warm_up(only_if_cold=lambda: print_line(wait, sys.stderr))
     start = time.perf_counter()
-    with plugin.temporary_folder("topoloc-doctor-") as folder:
+    with core_names.temporary_folder("topoloc-doctor-") as folder:
         recording = topoloc.open_sequence(f"{SHIPPED / 'map_lap1'}@0:6")
         topoloc.build_map(recording).save(folder / "room.topo")
         with topoloc.TopoMetricMap.load(folder / "room.topo") as topomap:

@@ -17,9 +17,11 @@ from typing import Annotated, Any
 import tyro
 
 import topoloc  # most names of it load OpenCV; `topoloc doctor` must run without
-from topoloc import MissingExtraError, TopolocError, plugin
+from topoloc import MissingExtraError, TopolocError
+from topoloc.apps import core_names
 from topoloc.apps.cli import printable
-from topoloc.plugin import remove_stale_files, write_text
+from topoloc.apps.core_names import remove_stale_files
+from topoloc.plugin import write_text
 
 
 def option(metavar: str, default: str = "", **more: Any) -> Any:
@@ -101,7 +103,7 @@ def describe_recording(
     steps = sorted(after - before for before, after in pairwise(t_ns))
     if steps and steps[-1] > 10 * steps[len(steps) // 2]:
         facts.append(f"largest gap {steps[-1] / 1e9:.1f} s")
-    return f"{path}: {plugin.find_format(path, format, camera)}, {', '.join(facts)}"
+    return f"{path}: {core_names.find_format(path, format, camera)}, {', '.join(facts)}"
 
 
 class UsageError(TopolocError):
@@ -114,7 +116,7 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str | None] = 
     answers in a recording may be. Raises TopolocError: the folder is missing or read-only, the path
     is no regular file, or a file is used twice."""
     taken = {os.path.realpath(path) for path in inputs if path}
-    folders = {os.path.realpath(plugin.split_selection(path)[0]) for path in inputs if path}
+    folders = {os.path.realpath(core_names.split_selection(path)[0]) for path in inputs if path}
     for path in (Path(output) for output in outputs if output not in (None, "-")):
         parents = {str(one) for one in Path(os.path.realpath(path)).parents}
         faults = {
@@ -125,7 +127,7 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str | None] = 
             "this file is used twice": os.path.realpath(path) in taken,
             "it is a file of the input; choose another path, or remove it first": path.exists()
             and bool(parents & folders)
-            and not plugin.has_answers(path),
+            and not core_names.has_answers(path),
         }
         if fault := next((text for text, is_found in faults.items() if is_found), None):
             raise TopolocError(f"cannot write {path}: {fault}")

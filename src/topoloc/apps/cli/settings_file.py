@@ -18,7 +18,8 @@ from typing import Any, TypeVar
 from topoloc import ConfigError
 from topoloc.apps.cli import PLUGIN_PACKAGES, all_commands, load_plugins
 from topoloc.apps.cli.output import UsageError
-from topoloc.plugin import describe_ranges, parse_tables, suggest_name, with_setting
+from topoloc.apps.core_names import describe_ranges, parse_tables, suggest_name
+from topoloc.plugin import with_setting
 
 T = TypeVar("T")
 

@@ -17,7 +17,8 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc import WeightsError
-from topoloc.plugin import NetworkInfo, atomic_write, cache_folder
+from topoloc.apps.core_names import NetworkInfo
+from topoloc.plugin import atomic_write, cache_folder
 
 CONVERTERS = "topoloc.network_converters"
 """Group of entry points. `convert(kind, weights, target, properties)` writes the ONNX file of

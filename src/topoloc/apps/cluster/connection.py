@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from topoloc import ClusterError, MissingExtraError
-from topoloc.plugin import temporary_folder
+from topoloc.apps.core_names import temporary_folder
 
 LOCAL, AUTO = "local", "auto"
 _CONNECT_TIMEOUT_S = 5.0

@@ -23,7 +23,7 @@ from topoloc import Atlas, AtlasError, Tile, TopolocError, TopoMetricMap
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import OnJobState, run_on_ray
-from topoloc.plugin import check_tile_id, temporary_folder
+from topoloc.apps.core_names import check_tile_id, temporary_folder
 
 State = Literal["built", "recognised", "updated", "there", "failed"]
 

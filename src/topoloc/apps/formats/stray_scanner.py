@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from topoloc import Camera, RecordingError, Rigid3, StereoFrame, TrajectoryError, read_image
+from topoloc.apps.core_names import parse_calibration
 from topoloc.plugin import (
     IndexedFrames,
     RecordingFormat,
     Video,
     depth_image_of,
-    parse_calibration,
     read_depth_image,
     read_text,
 )

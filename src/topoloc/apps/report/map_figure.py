@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from topoloc import EvaluatedQuery, Evaluation, Localization, Rigid3, TopoMetricMap
+from topoloc.apps.core_names import format_length
 from topoloc.apps.report.page_template import (
     BAD,
     ERROR,
@@ -24,7 +25,6 @@ from topoloc.apps.report.page_template import (
     recording_colours,
     svg_text,
 )
-from topoloc.plugin import format_length
 
 # Height over width of the map.
 MIN_ASPECT, MAX_ASPECT = 0.3, 0.8

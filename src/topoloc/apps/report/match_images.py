@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from topoloc import Camera, EvaluatedQuery, Image, Localization, MapError, TopoNode
+from topoloc.apps.core_names import NodeMatcher
 from topoloc.apps.viewer.map_scene import read_node_rgb
-from topoloc.plugin import NodeMatcher
 
 # Images are shown and matched at these widths or less.
 IMAGE_WIDTH_PX = 480

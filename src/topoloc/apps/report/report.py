@@ -20,6 +20,7 @@ from topoloc import (
     TopoNode,
     UnreadableImageError,
 )
+from topoloc.apps.core_names import NodeMatcher, encode_jpeg, format_length
 from topoloc.apps.report.figures import draw_error_curves, draw_errors_along, draw_stage_times
 from topoloc.apps.report.map_figure import draw_map
 from topoloc.apps.report.match_images import (
@@ -44,7 +45,7 @@ from topoloc.apps.report.report_tables import (
 )
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import embedded_head, embedded_scene
-from topoloc.plugin import NodeMatcher, encode_jpeg, format_length, write_text
+from topoloc.plugin import write_text
 
 NUM_WORST = 6
 

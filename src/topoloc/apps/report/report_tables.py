@@ -8,8 +8,8 @@ from html import escape
 from typing import Any
 
 from topoloc import EvaluatedQuery
+from topoloc.apps.core_names import format_length
 from topoloc.apps.report.page_template import recording_colours, render_cards, render_table
-from topoloc.plugin import format_length
 
 _COLUMNS = (
     "recording",

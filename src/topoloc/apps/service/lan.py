@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from topoloc import MissingExtraError, TopolocError
-from topoloc.plugin import temporary_folder
+from topoloc.apps.core_names import temporary_folder
 
 _DAYS = 30  # that the certificate is valid
 _ELSEWHERE = "192.0.2.1"  # of no machine (RFC 5737); nothing is sent to it

@@ -36,12 +36,13 @@ from topoloc import (
     WeightsError,
     read_image,
 )
+from topoloc.apps.core_names import Deadline
 from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.apps.report.explanation_page import compared_to_json, explanation_page
 from topoloc.apps.service.logs import log
 from topoloc.apps.service.query_request import QueryRequest, parse_camera_field
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.plugin import Deadline, EncodedImage, image_size
+from topoloc.plugin import EncodedImage, image_size
 
 POLL_INTERVAL_S = 5.0
 """Seconds between two checks of an object store: one listing each, and a reading if it changed."""

@@ -22,10 +22,11 @@ from topoloc import (
     TrajectoryError,
     UncalibratedCamera,
 )
+from topoloc.apps.core_names import exif_focal_length
 from topoloc.apps.query_camera import parse_camera_option
 from topoloc.apps.service.openapi_schemas import QueryParameters
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.plugin import EncodedImage, decode_json, exif_focal_length
+from topoloc.plugin import EncodedImage, decode_json
 
 _MAX_FIELD_BYTES = 20_000
 _MAX_MS = 600_000.0

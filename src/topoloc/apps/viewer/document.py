@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from topoloc import Camera, Rigid3, TopoMetricMap, read_image
+from topoloc.apps.core_names import encode_jpeg
 from topoloc.apps.viewer.map_scene import sample_colours, unique_image_names
-from topoloc.plugin import EncodedImage, encode_jpeg
+from topoloc.plugin import EncodedImage
 
 GAP_STEPS = 6.0
 """A step longer than this many median steps is a gap, over which no line is drawn."""

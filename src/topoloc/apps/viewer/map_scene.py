@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from topoloc import MapError, TopoMetricMap, TopoNode
+from topoloc.apps.core_names import NodeMatcher
 from topoloc.apps.viewer.scene import Points, Progress, Scene, View
-from topoloc.plugin import NodeMatcher
 
 NUM_NEIGHBOURS = 8
 MAX_ERROR_PX = 3.0

@@ -32,8 +32,8 @@ from topoloc import (
 )
 from topoloc.apps.cli.output import UsageError, describe_recording, open_recording, print_line
 from topoloc.apps.cluster.remote import Progress
+from topoloc.apps.core_names import has_scale, scale_poses, split_selection
 from topoloc.apps.formats.colmap import estimate_metric_scale
-from topoloc.plugin import has_scale, scale_poses, split_selection
 
 MIN_OVERLAP = 3
 

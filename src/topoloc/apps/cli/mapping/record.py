@@ -22,12 +22,12 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
+from topoloc.apps.core_names import parse_calibration
 from topoloc.apps.formats.carla import CarlaConfig, carla_client, carla_frames
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.formats.recording_writer import RecordingWriter
 from topoloc.apps.formats.svo import sdk_frames
 from topoloc.apps.formats.zed import side_by_side_frames
-from topoloc.plugin import parse_calibration
 
 _ZED_SIZE = (2560, 720)
 

@@ -45,7 +45,8 @@ from topoloc.apps.cli.queries.remote_queries import QueryRecording, RemoteMap, l
 from topoloc.apps.cli.queries.self_evaluation import evaluate_map_itself
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.plugin import decode_json, format_length, read_text
+from topoloc.apps.core_names import format_length
+from topoloc.plugin import decode_json, read_text
 
 
 @dataclass(frozen=True)

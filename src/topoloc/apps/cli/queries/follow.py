@@ -27,13 +27,13 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.apps.cli.queries.query_answers import QueryFrame, capture_frames, format_answer
 from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.core_names import as_monocular
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.mavlink import DroneLocalizer
 from topoloc.apps.robots.robot_localizer import RobotLocalizer
 from topoloc.apps.robots.ros_images import RosImages, is_topic
 from topoloc.apps.robots.ros_node import RosNode
-from topoloc.plugin import as_monocular
 
 
 @dataclass(frozen=True)

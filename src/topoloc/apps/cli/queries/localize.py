@@ -64,9 +64,9 @@ from topoloc.apps.cli.queries.query_answers import (
     to_trajectory,
 )
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
+from topoloc.apps.core_names import as_monocular, find_format, split_selection
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.query_camera import CameraOfSize
-from topoloc.plugin import as_monocular, find_format, split_selection
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,9 @@ from topoloc import (
     check_camera_calibrations,
 )
 from topoloc.apps.cli.output import print_line, print_warning, write_text
+from topoloc.apps.core_names import format_length
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
-from topoloc.plugin import format_length
 
 
 @dataclass(frozen=True, eq=False)

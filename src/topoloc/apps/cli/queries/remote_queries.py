@@ -36,7 +36,7 @@ from topoloc.apps.cli.output import open_recording, print_warning
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
-from topoloc.plugin import find_available_types
+from topoloc.apps.core_names import find_available_types
 
 MAX_IMAGES = 50
 """Images of a piece. It takes about a second to open map and recording, much less than these."""

@@ -20,6 +20,7 @@ from topoloc import (
     StereoRig,
     UnreadableImageError,
 )
+from topoloc.apps.core_names import find_white_level
 from topoloc.apps.formats.bags.bag import (
     MCAP_SUFFIXES,
     Bag,
@@ -46,7 +47,6 @@ from topoloc.plugin import (
     IndexedFrames,
     RecordingFormat,
     depth_image_of,
-    find_white_level,
     match_times,
 )
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from topoloc import RecordingError
+from topoloc.apps.core_names import suggest_name
 from topoloc.apps.formats.bags.bag import Bag
 from topoloc.apps.formats.bags.messages import (
     CALIBRATION_TYPES,
@@ -16,7 +17,6 @@ from topoloc.apps.formats.bags.messages import (
     POSE_TYPES,
     TRANSFORM_TYPES,
 )
-from topoloc.plugin import suggest_name
 
 ROLES = ("left", "right", "depth", "left_info", "right_info", "depth_info", "pose", "pose_frame")
 _ROLE_ALIASES: dict[str, str] = dict.fromkeys(("image", "mono", "color"), "left")

@@ -1,38 +1,40 @@
-"""Decide the result of a query from its belief: a pose, alternatives, or a reason for none."""
+"""Turn the belief about an image into an answer, which the checks then refine or refuse.
+
+`lead` names the likeliest hypothesis of a belief, its alternatives if others rival it, or the
+reason for a refusal. Each check of `checks.py` returns a `Finding`. `Answer.after` applies it.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from topoloc.geometry.camera import Camera, UncalibratedCamera
-from topoloc.geometry.joint_camera.camera_hypotheses import (
-    CameraBelief,
-    CameraHypothesis,
-    WeighedCamera,
-    map_variance,
-)
+from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
-from topoloc.geometry.rolling_shutter import TurningCamera, find_rotation
-from topoloc.localization.belief import Hypothesis, log_odds_margin
+from topoloc.localization.belief import (
+    Hypothesis,
+    log_odds_margin,
+    select_probable,
+    share_probability,
+)
 from topoloc.localization.evidence import (
-    compute_normalized_uncertainty,
     compute_translation_tolerance,
     highest_probability,
     is_only_imprecise,
 )
-from topoloc.localization.image_calibration_check import check_image_calibration, find_focal_doubt
+from topoloc.localization.image_calibration_check import find_focal_doubt
+from topoloc.localization.map_context import MapContext
 from topoloc.localization.map_facts.correlated_errors import shape_as_motion
 from topoloc.localization.pose_fit import PointMatches, PointObservations
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
-
-MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
-
 
 LocalizationWithInliers = tuple[Localization, PointObservations]
 """A pose and its inliers, in pixels of the original image."""
@@ -40,122 +42,128 @@ ResultWithInliers = tuple[Localization | NotLocalized, list[LocalizationWithInli
 """A result with each reported pose and its inliers: its own pose, or its alternatives in order."""
 
 
-def decide_result(search: Search) -> ResultWithInliers:
-    """Return the result that follows from the current belief."""
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """Hold what a check found about an answer.
+
+    `text` states it in one line. `factor` multiplies the probability. `facts` holds new values of
+    fields of the result. `hypothesis` is the pose if it was fitted again, and `points` are its
+    inliers if they differ. `refusal` holds reason and detail if the answer is refused. `answer`
+    replaces a refusal.
+    """
+
+    check: str
+    text: str
+    factor: float = 1.0
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    hypothesis: Hypothesis | None = None
+    points: PointObservations | None = None
+    refusal: tuple[Reason, str] | None = None
+    answer: Answer | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Hold the answer of one map: the result, each reported pose with its inliers and its
+    hypothesis, and the findings of the checks so far.
+
+    `search` is that of the feature type that decided, and `best` its likeliest hypothesis.
+    """
+
+    search: Search
+    best: Hypothesis | None
+    result: Localization | NotLocalized
+    poses: list[LocalizationWithInliers]
+    hypotheses: list[Hypothesis] = field(default_factory=list)
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def pose(self) -> Localization | None:
+        """Return the pose, None if the image is refused."""
+        return self.result if isinstance(self.result, Localization) else None
+
+    def after(self, finding: Finding | None) -> Answer:
+        """Return the answer that follows from the finding of a check."""
+        if finding is None:
+            return self
+        findings, pose = (*self.findings, finding), self.pose
+        if finding.answer is not None:
+            return replace(finding.answer, findings=findings)
+        if pose is None:
+            return replace(self, findings=findings)
+        best, points = finding.hypothesis or self.best, finding.points or self.poses[0][1]
+        probability = finding.factor * pose.probability
+        if finding.hypothesis is None:
+            pose = replace(pose, probability=probability)
+        else:
+            pose, points = _build_localization(self.search, finding.hypothesis, probability)
+        pose = replace(pose, **finding.facts)
+        if finding.refusal is not None:
+            refusal = refuse(self.search, pose, *finding.refusal)
+            return Answer(self.search, best, refusal, [], [], findings)
+        hypotheses = [] if best is None else [best]
+        return Answer(self.search, best, pose, [(pose, points)], hypotheses, findings)
+
+    def with_provenance(self, opened: MapContext, camera: Camera | UncalibratedCamera) -> Answer:
+        """Return the answer with the identity of its map, the camera and the geoposes."""
+        poses = [(opened.with_provenance(pose, camera), seen) for pose, seen in self.poses]
+        return replace(self, result=opened.with_provenance(self.result, camera), poses=poses)
+
+    def margin_over(self, search: Search, rival: Hypothesis) -> float:
+        """Return the log-odds margin of the pose over a hypothesis of another map's search.
+
+        It separates similar places, if both are of one feature type. If not, it is the difference
+        of their log-odds.
+        """
+        best = self.hypotheses[0]
+        if self.search.map.kind.name != search.map.kind.name:
+            return best.log_odds - rival.log_odds
+        return log_odds_margin(best, rival, self.search.weights.rivals)
+
+
+def lead(search: Search) -> Answer:
+    """Return the answer that follows from the belief of a search."""
     rivals, min_probability = search.weights.rivals, search.config.evidence.min_probability
     ranked = search.belief.ranked(rivals)
     if not ranked or ranked[0].probability < min_probability:
-        return _explain_not_localized(search, ranked), []
+        best = ranked[0] if ranked else None
+        return Answer(search, best, _explain_not_localized(search, best), [])
     best = ranked[0]
     log_odds_margins = [_log_odds_margin(search, best, other) for other in ranked[1:]]
-    others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in log_odds_margins)
-    probability = best.evidence.precision_probability / (1.0 + others)
+    shares = share_probability(math.exp(-best.log_odds), log_odds_margins)
+    probability = best.evidence.precision_probability * shares[0]
     is_leading = all(
         by >= (rivals.unclear_lead if _is_unclear_and_distant(search, best, other) else rivals.lead)
         for by, other in zip(log_odds_margins, ranked[1:], strict=True)
     )
     if is_leading and probability >= min_probability:
-        named = _build_localization(search, best, probability)
-        if named[0].probability >= min_probability:
-            return named[0], [named]
-    return _ambiguous_result(search, ranked, log_odds_margins, others)
-
-
-def decide_final_result(search: Search) -> ResultWithInliers:
-    """Return `decide_result` after a check against the camera calibration.
-
-    It runs when no other feature type follows. If the image contradicts its calibration, the
-    covariance grows by the induced shift. The probability falls accordingly, and the pose may be
-    refused.
-    """
-    result, named = decide_result(search)
-    if isinstance(result, NotLocalized):
-        return result, named
-    best = search.belief.ranked(search.weights.rivals)[0]
-    if best.fit.pose.camera is not None:
-        return _weigh_camera(search, best, result, best.fit.pose.camera)
-    with search.query.clock.stage("calibration"):
-        turning, frame_rotation_deg = _find_rotation(search, best), None
-        is_evident = turning is not None and turning.is_evident
-        seen, doubt = (None, None) if is_evident else check_image_calibration(search, best.fit)
-        # a rotation that is not evident is still likelier than a wrong calibration
-        if turning is not None and (is_evident or doubt is not None):
-            best = _undo_rotation(best, turning)
-            frame_rotation_deg = float(np.rad2deg(np.linalg.norm(turning.rotation)))
-            seen, doubt = check_image_calibration(search, best.fit)
-    if doubt is None:
-        if frame_rotation_deg is not None:
-            result, points = _build_localization(search, best, result.probability)
-            result = replace(result, frame_rotation_deg=frame_rotation_deg)
-            named = [(result, points)]
-        result = replace(result, seen_camera=seen, times_ms=search.query.clock.times_ms())
-        return result, [(result, points) for _, points in named]
-    covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
-    uncertainty = compute_normalized_uncertainty(
-        covariance, best.fit.median_depth, search.config.evidence
-    )
-    evidence = replace(best.evidence, doubt=max(best.evidence.doubt, uncertainty))
-    penalized = replace(best, covariance=covariance, evidence=evidence)
-    # inliers by the wrong camera hide a part of the shift: half of it in `benchmarks/inputs.py`
-    half = best.covariance + 0.25 * np.outer(doubt.shift, doubt.shift)
-    shifted = WeighedCamera(CameraHypothesis(), 1.0, doubt.shift, half)
-    camera = CameraBelief(shifted.hypothesis, [shifted])
-    probability = result.probability * _probability_within(search, best, camera)
-    if probability < search.config.evidence.min_probability:
-        search.is_refuted = True
-        refusal = _build_not_localized(
-            search, "too_few_inliers", best.fit, f"the calibration is doubtful: {doubt}"
-        )
-        return replace(refusal, seen_camera=seen), []
-    localization, points = _build_localization(search, penalized, probability)
-    localization = replace(localization, calibration_doubt=doubt, seen_camera=seen)
-    return localization, [(localization, points)]
-
-
-def _find_rotation(search: Search, best: Hypothesis) -> TurningCamera | None:
-    """Return the camera that turned while a rolling shutter read its rows, None if it may be at
-    rest."""
-    if not best.evidence.is_of_nodes:
-        return None
-    fit, seen = best.fit, best.fit.inlier_observations(1.0)
-    return find_rotation(
-        seen.points_img.astype(np.float64),
-        seen.points_world,
-        seen.covariances,
-        search.config.pose.key_point_sigma_px,
-        fit.camera,
-        fit.cam_from_world,
-        map_variance(search.correlated_error_share),
-    )
-
-
-def _undo_rotation(best: Hypothesis, turning: TurningCamera) -> Hypothesis:
-    """Return the hypothesis as if all rows had been read at once."""
-    fit = best.fit
-    points_img = turning.undo(fit.features.points_img.astype(np.float64), fit.camera)
-    features = replace(fit.features, points_img=points_img.astype(np.float32))
-    covariance = fit.pose.covariance + turning.covariance
-    pose = replace(fit.pose, cam_from_world=turning.cam_from_world, covariance=covariance)
-    fit = replace(fit, features=features, pose=pose)
-    return replace(best, fit=fit, covariance=best.covariance + turning.covariance)
+        pose, points = _build_localization(search, best, probability)
+        if pose.probability >= min_probability:
+            return _weigh_camera(search, best, pose, points)
+    return _ambiguous_answer(search, ranked, shares)
 
 
 def _weigh_camera(
-    search: Search, best: Hypothesis, result: Localization, camera: CameraBelief
-) -> ResultWithInliers:
-    """Return the result of a camera without calibration, with the probability that the pose is
-    within the tolerance whatever its camera may be."""
-    probability = result.probability * _probability_within(search, best, camera)
-    if probability >= search.config.evidence.min_probability:
-        named = _build_localization(search, best, probability)
-        return named[0], [named]
-    detail = "a cropped image or another lens would put the camera elsewhere: state --camera"
-    if camera.is_contradicted:
-        detail = "the image contradicts all camera models, as a panorama does: state --camera"
-    return _build_not_localized(search, "too_few_inliers", best.fit, detail), []
+    search: Search, best: Hypothesis, pose: Localization, points: PointObservations
+) -> Answer:
+    """Return the answer with the probability that the pose is within the tolerance for any camera
+    that is as likely, if the image has no calibration."""
+    camera = best.fit.pose.camera
+    if camera is not None:
+        pose = replace(
+            pose, probability=pose.probability * probability_within(search, best, camera)
+        )
+        if pose.probability < search.config.evidence.min_probability:
+            detail = "a cropped image or another lens would put the camera elsewhere"
+            if camera.is_contradicted:
+                detail = "the image contradicts all camera models, as a panorama does"
+            detail = f"{detail}: state --camera"
+            refusal = _build_not_localized(search, "too_few_inliers", best.fit, detail)
+            return Answer(search, best, refusal, [])
+    return Answer(search, best, pose, [(pose, points)], [best])
 
 
-def _probability_within(search: Search, best: Hypothesis, camera: CameraBelief) -> float:
+def probability_within(search: Search, best: Hypothesis, camera: CameraBelief) -> float:
     """Return the probability that a camera moves the pose by less than the tolerances."""
     config = search.config.evidence
     max_translation = compute_translation_tolerance(best.fit.median_depth, config)
@@ -224,21 +232,10 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     return replace(best, covariance=total, noise_share=float(share))
 
 
-def _ambiguous_result(
-    search: Search, ranked: list[Hypothesis], log_odds_margins: list[float], others: float
-) -> ResultWithInliers:
-    """Return an ambiguous result with the probability of each alternative."""
-    best = ranked[0]
-    shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in log_odds_margins)]
-    probable = [
-        pair
-        for pair in zip(ranked, shares, strict=True)
-        if pair[1] >= MIN_ALTERNATIVE_RATIO * shares[0]
-    ]
-    named = [
-        _build_localization(search, one, share)
-        for one, share in sorted(probable, key=lambda pair: -pair[1])
-    ]
+def _ambiguous_answer(search: Search, ranked: list[Hypothesis], shares: list[float]) -> Answer:
+    """Return an ambiguous answer with the probability of each alternative."""
+    best, probable = ranked[0], select_probable(ranked, shares)
+    named = [_build_localization(search, one, share) for one, share in probable]
     alternatives = tuple(
         Alternative(one.world_from_cam, one.probability, one.node_id) for one, _ in named
     )
@@ -247,17 +244,17 @@ def _ambiguous_result(
         first, second = alternatives[:2]
         reason = "ambiguous"
         detail = f"as much like node {second.node_id} as like node {first.node_id}"
-    return _build_not_localized(search, reason, best.fit, detail, alternatives), named
+    refusal = _build_not_localized(search, reason, best.fit, detail, alternatives)
+    return Answer(search, best, refusal, named, [one for one, _ in probable])
 
 
-def _explain_not_localized(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
-    if not ranked:
+def _explain_not_localized(search: Search, best: Hypothesis | None) -> NotLocalized:
+    if best is None:
         first = search.first
         num_matches = 0 if first is None else len(first.matches)
         is_enough = num_matches >= search.config.min_matches
         reason = "too_few_inliers" if is_enough else "too_few_matches"
         return _build_not_localized(search, reason, first)
-    best = ranked[0]
     if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
         detail = _describe_imprecision(best)
         return _build_not_localized(search, "too_few_inliers", best.fit, detail)
@@ -286,6 +283,18 @@ def _build_not_localized(
         "; ".join(filter(None, details)),
         alternatives,
         _provenance(search),
+    )
+
+
+def refuse(search: Search, pose: Localization, reason: Reason, detail: str) -> NotLocalized:
+    """Return the refusal of a pose."""
+    return replace(
+        _build_not_localized(search, reason, None, detail),
+        num_matches=pose.num_matches,
+        num_inliers=pose.num_inliers,
+        provenance=pose.provenance,
+        seen_camera=pose.seen_camera,
+        appearance=pose.appearance,
     )
 
 
