@@ -95,11 +95,6 @@ class TileFetch:
     future: Future[Path | Exception] = field(default_factory=Future)
     finished_at: float = float("inf")
 
-    @property
-    def is_stale(self) -> bool:
-        """Return whether the fetch ended so long ago that it may be repeated."""
-        return time.monotonic() > self.finished_at + RETRY_AFTER_S
-
 
 class TilePending(Exception):
     """Signal that the tile is being fetched. The caller may try again when the fetch has ended."""
@@ -150,7 +145,9 @@ class TileFetcher:
         where, key = atlas.store.where, (atlas.store.where, tile.map.name)
         with self._lock:
             self._fetches = {
-                one: fetch for one, fetch in self._fetches.items() if not fetch.is_stale
+                one: fetch
+                for one, fetch in self._fetches.items()
+                if time.monotonic() <= fetch.finished_at + RETRY_AFTER_S
             }
             if key in self._fetches:
                 return self._fetches[key]

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, no_type_check
 import numpy as np
 
 from topoloc.errors import EmptyMapError, FeatureTypeError
+from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.certificate import Certificate
@@ -143,7 +144,8 @@ class TopoMetricMap:
 
     def sides_for(self, kind: str) -> VirtualNodes | None:
         """Return the virtual nodes that are queried with this feature type, if any."""
-        return self.sides if self.sides is not None and self.sides.is_used_with(kind) else None
+        kinds = (kind, find_feature_type(kind).virtual_view_type)
+        return self.sides if self.sides is not None and self.sides.kind in kinds else None
 
     def describe(self, path: str | Path) -> dict[str, Any]:
         """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,

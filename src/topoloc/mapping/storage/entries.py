@@ -13,7 +13,6 @@ from typing import Any, TypeVar, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int8, UInt8
 
-from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -254,11 +253,6 @@ class VirtualNodes:
     nodes: Sequence[TopoNode]
     coarse_models: Mapping[str, CoarseModel]
     kind: str
-
-    def is_used_with(self, kind: str) -> bool:
-        """Return whether the virtual nodes are queried together with the nodes' points of this
-        feature type."""
-        return self.kind in (kind, find_feature_type(kind).virtual_view_type)
 
 
 @dataclass(frozen=True, order=True)
