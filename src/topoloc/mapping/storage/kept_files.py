@@ -15,10 +15,9 @@ import shutil
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from itertools import accumulate
 from pathlib import Path
-from typing import TypeVar
 
 from topoloc.errors import MapError
 from topoloc.mapping.validation import describe_failure
@@ -60,18 +59,6 @@ def lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[os.stat_
             close(descriptor)
 
 
-@contextmanager
-def no_edit_of(path: Path, on_wait: WaitCallback | None) -> Iterator[None]:
-    """Wait until no other edits the map at `path`, and keep others from it meanwhile. A missing or
-    unreadable file is not locked. Raises MapError if this thread edits the map."""
-    with ExitStack() as stack:
-        if os.path.isfile(path):
-            with suppress(OSError):
-                stack.enter_context(lock_map_file(path, on_wait))
-        yield
-
-
-T = TypeVar("T")
 _MAX_BYTES = 1_000_000_000
 """Bytes of all kept files of a map together. The newest file is kept at any size."""
 

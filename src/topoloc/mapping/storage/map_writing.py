@@ -12,7 +12,7 @@ import json
 import os
 import sqlite3
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -25,7 +25,12 @@ from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import encode_statistics
 from topoloc.mapping.storage.entries import Session, TopoNode
-from topoloc.mapping.storage.kept_files import WaitCallback, drop_kept_files, keep_file, no_edit_of
+from topoloc.mapping.storage.kept_files import (
+    WaitCallback,
+    drop_kept_files,
+    keep_file,
+    lock_map_file,
+)
 from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
 from topoloc.mapping.storage.schema import (
     APPLICATION_ID,
@@ -65,7 +70,10 @@ def save_map(
     """
     if os.path.isdir(path):  # Path.is_dir raises an error for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
-    with no_edit_of(path, on_wait):
+    with ExitStack() as stack:
+        if os.path.isfile(path):
+            with suppress(OSError):  # it cannot be read, so nobody edits it
+                stack.enter_context(lock_map_file(path, on_wait))
         replace_file(topomap, path, is_old_kept)
 
 
