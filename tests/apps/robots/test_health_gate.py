@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.map_to_odom import Evidence, HealthGate
 from topoloc.geometry.rigid import Rigid3
 
@@ -36,13 +35,13 @@ def _verdicts(gate: HealthGate, evidence: Sequence[Evidence]) -> str:
 @pytest.fixture
 def gate() -> HealthGate:
     """A gate that has found the robot in the first half second."""
-    gate = HealthGate(RobotConfig())
+    gate = HealthGate()
     assert _verdicts(gate, [_evidence(0.2 * k) for k in range(3)]) == "ddj"
     return gate
 
 
 def test_the_first_pose_needs_several_images_that_agree():
-    gate = HealthGate(RobotConfig(confirm_images=4))
+    gate = HealthGate(num_confirming=4)
     assert _verdicts(gate, [_evidence(0.1), _evidence(0.2, AWAY), _evidence(0.3)]) == "ddd"
     assert gate.agreed is None
     assert _verdicts(gate, [_evidence(0.1 * k) for k in range(4, 8)]) == "ddjf"
@@ -50,7 +49,7 @@ def test_the_first_pose_needs_several_images_that_agree():
 
 def test_tracked_points_confirm_no_new_place():
     """They have the errors of the image that was localized wrongly."""
-    gate = HealthGate(RobotConfig())
+    gate = HealthGate()
     tracked = [_evidence(0.1 * k, is_localized=False) for k in range(20)]
     assert set(_verdicts(gate, [_evidence(0.0), *tracked])) == {"d"}
 
@@ -105,7 +104,7 @@ def test_images_that_odometry_contradicts_confirm_no_jump(gate: HealthGate):
 def test_after_a_long_way_in_the_dark_the_drift_is_no_jump(gate: HealthGate):
     """20 metres at five per cent: a metre is one sigma."""
     assert _verdicts(gate, [_evidence(40.0, drift=1.0)]) == "f"
-    assert _verdicts(HealthGate(RobotConfig()), [_evidence(40.0, drift=1.0)]) == "d"
+    assert _verdicts(HealthGate(), [_evidence(40.0, drift=1.0)]) == "d"
 
 
 def test_a_pose_of_the_user_confirms_the_next_image(gate: HealthGate):
