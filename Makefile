@@ -4,7 +4,7 @@
 # make test-slow   the few tests that `make test` leaves out for their time: the paper made again, networks trained
 # make acceptance   the commands as a user types them, on the recordings in ../shared; compares figures with benchmarks/acceptance.json
 # make acceptance-quick   the part of it that takes at most three minutes
-# make lint      the same without the tests
+# make lint      the same without the tests; warns of figures above their budgets (tools/budgets.py)
 # make docs      these pages as HTML, in docs/_build/html; a warning is an error
 # make release REPOSITORY=https://github.com/OWNER/topoloc   the four distributions, in dist/, with the addresses for an index
 # make clean     remove what the above made
@@ -51,6 +51,7 @@ lint: $(VENV)/installed-test
 	@$(BIN)/ruff format --check --quiet || { $(BIN)/ruff format --check; exit 1; }
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.txt || { cat $(VENV)/lint-imports.txt; exit 1; }
 	@$(PYRIGHT)
+	@$(BIN)/python tools/budgets.py
 
 docs: $(VENV)/installed-docs
 	@$(BIN)/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going -d docs/_build/trees docs docs/_build/html

@@ -1,13 +1,16 @@
 """Run the same inputs with an old commit and with this source tree, and compare the answers.
 
-    python benchmarks/equality.py OLD_COMMIT [--quick] [--shared ../shared] [--cache FOLDER]
+    python benchmarks/equality.py OLD_COMMIT [--quick] [--tree PATH] [--shared ../shared]
+        [--cache FOLDER] [--only CASE ...] [--json FILE]
 
-Both sides run the command line in processes of their own on this machine. Reason, tile and node
-must be equal; position, angle and probability may differ by 1e-6 (metres, radians). This tree
-answers without its last step (`fast.toml`), which old commits had not. The old commit is unpacked
-into a temporary folder and compiles its kernels there, which takes about half a minute.
-`--cache FOLDER` keeps its answers, by commit. `--only CASE` runs one case and those before it.
-The exit status is 1 on a difference.
+Both sides run the command line in processes of their own on this machine. Reason, state, tile and
+node must be equal; position, angle and probability may differ by 1e-6 (metres, radians), and
+covariances by 1e-6 of their diagonals. If the old commit had no last step, this tree answers
+without it (`fast.toml`), covariances are left out, and there are fewer cases. `--tree` is another
+source tree instead of this one. The old commit is unpacked into a temporary folder and compiles its
+kernels there, which takes about half a minute. `--cache FOLDER` keeps its answers, by commit and
+case. `--only CASE` runs one case and prepares those before it. The exit status is 1 on a
+difference.
 """
 
 from __future__ import annotations
@@ -20,88 +23,22 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from acceptance_jobs.answers import Comparison, compare_answers, kept
+from acceptance_jobs.answers import Comparison, compare_answers, kept, without_appearance
+from acceptance_jobs.equality_cases import Case, Words, cases
+from acceptance_jobs.varied_images import vary
 from acceptance_jobs.workplace import ROOT, JobError, last_line, read_lines, run
 
-Words = tuple[object, ...]
 Answers = dict[str, list[dict[str, Any]]]
 
 
-@dataclass(frozen=True)
-class Case:
-    """Hold the commands of one comparison: preparation, then one that writes results to a file."""
-
-    name: str
-    prepare: tuple[Words, ...]
-    query: Words
-    results: str
-
-
-def spread(folder: Path, pattern: str, number: int) -> list[Path]:
-    """Return so many files, evenly chosen in their order."""
-    files = sorted(folder.rglob(pattern))
-    return [files[i * len(files) // number] for i in range(min(number, len(files)))]
-
-
-def localize(name: str, where: str, *inputs: object, **options: object) -> tuple[Words, str]:
-    """Return a command that localizes each image alone, and the name of its file of results."""
-    words: list[object] = [word for key, value in options.items() for word in (f"--{key}", value)]
-    return ("localize", where, *inputs, "--single", *words, "--json", f"{name}.jsonl"), (
-        f"{name}.jsonl"
-    )
-
-
-def cases(data: Path, quick: bool) -> list[Case]:
-    """Return the cases; the maps of earlier ones are there for later ones."""
-    lab = ROOT / "src" / "topoloc" / "demo" / "lab"
-    asked = [lab / name for name in ("day", "night", "other_camera", "street", "corridor")]
-    demo = Case("demo", (("demo", "--out", "demo"),), *localize("lab", "demo/lab.topo", *asked))
-    if not data.is_dir():
-        return [demo]
-    kitchen, street = data / "seven_scenes/kitchen", data / "kitti/sequences/street1"
-    zed = data / "zed_lab"
-    outside = spread(data / "ie_tower", "*.jpg", 30) + spread(data / "gardenspoint", "*.jpg", 15)
-    outside += spread(data / "kitti/sequences/street2/image_0", "*.png", 15)
-    colour = spread(kitchen, "*.color.jpg", 70)
-    build_zed = ("build", zed / "session1", "zed.topo")
-    build_kitchen = ("build", f"{kitchen}@0::2", "kitchen.topo", "--d-thresh", 0.5)
-    build_street = ("build", f"{street}@0::2", "street.topo")
-    if quick:
-        few = localize("zed", "zed.topo", f"{zed}/session2@0:99:4")
-        away = localize("outside", "zed.topo", *outside[::4], camera="unknown")
-        return [demo, Case("zed", (build_zed,), *few), Case("out of map", (), *away)]
-    tiles = ("zed.topo", "kitchen.topo", "street.topo")
-    inside = [
-        *colour[3::14],
-        *spread(zed / "session2/image_0", "*.jpg", 6),
-        outside[0],
-        outside[-1],
-    ]
-    return [
-        demo,
-        Case("zed", (build_zed,), *localize("zed", "zed.topo", f"{zed}/session2")),
-        Case("kitchen", (build_kitchen,), *localize("kitchen", "kitchen.topo", f"{kitchen}@1::2")),
-        Case("street", (build_street,), *localize("street", "street.topo", f"{street}@1::2")),
-        Case(
-            "uncalibrated",
-            (),
-            *localize("uncalibrated", "kitchen.topo", *colour[1:60:2], camera="unknown"),
-        ),
-        Case("out of map", (), *localize("outside", "zed.topo", *outside, camera="unknown")),
-        Case(
-            "atlas",
-            (("atlas", "create", "atlas", *tiles),),
-            *localize("atlas", "atlas", *inside, camera="unknown"),
-        ),
-    ]
-
-
-def answers_of(tree: Path, chosen: list[Case], timeout: float = 600) -> Answers:
-    """Return the answers of a source tree to all cases.
+def answers_of(
+    tree: Path, chosen: list[Case], wanted: list[str], is_full: bool, timeout: float = 1800
+) -> Answers:
+    """Return the answers of a source tree to the wanted cases; all are prepared.
 
     Raises:
         JobError: A command failed.
@@ -110,20 +47,41 @@ def answers_of(tree: Path, chosen: list[Case], timeout: float = 600) -> Answers:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for case in chosen:
-            for words in (*case.prepare, case.query):
-                command = [sys.executable, "-m", "topoloc", *words, *settings_of(tree, words)]
-                code, out, err = run(command, folder, tree, timeout)
-                if code != 0:
-                    raise JobError(
-                        f"{case.name}: exit status {code}: {last_line(err) or last_line(out)}"
-                    )
-            answers[case.name] = kept(read_lines(folder / case.results))
+            for words in case.prepare:
+                run_words(tree, case, words, folder, is_full, timeout)
+            if case.name in wanted:
+                out = run_words(tree, case, case.query, folder, is_full, timeout)
+                path = folder / case.results
+                if not path.exists():  # `follow` prints its answers
+                    path.write_text(out, encoding="utf-8")
+                found = kept(read_lines(path))
+                answers[case.name] = found if is_full else without_appearance(found)
     return answers
+
+
+def run_words(
+    tree: Path, case: Case, words: Words, folder: Path, is_full: bool, timeout: float
+) -> str:
+    """Return the standard output of a command of topoloc, or make images."""
+    if words[0] == "vary":
+        vary(str(words[1]), int(str(words[2])), folder / str(words[3]))
+        return ""
+    options = () if is_full else settings_of(tree, words)
+    command = [sys.executable, "-m", "topoloc", *words, *options]
+    code, out, err = run(command, folder, tree, timeout)
+    if code != 0:
+        raise JobError(f"{case.name}: exit status {code}: {last_line(err) or last_line(out)}")
+    return out
+
+
+def has_last_step(tree: Path) -> bool:
+    """Return whether the queries of a source tree end with a last step."""
+    return (tree / "src/topoloc/localization/exact").is_dir()
 
 
 def settings_of(tree: Path, words: Words) -> Words:
     """Return the options by which a tree with a last step answers without it, as it did before."""
-    if words[0] != "localize" or not (tree / "src/topoloc/localization/exact").is_dir():
+    if words[0] != "localize" or not has_last_step(tree):
         return ()
     return ("--config", ROOT / "benchmarks" / "fast.toml")
 
@@ -139,24 +97,67 @@ def unpack(commit: str, folder: Path) -> Path:
     return folder / "old"
 
 
-def old_answers(commit: str, chosen: list[Case], cache: Path | None) -> Answers:
-    """Return the answers of an old commit, from the cache if they are there."""
-    key = hashlib.sha256(repr([asdict(case) for case in chosen]).encode()).hexdigest()[:12]
-    kept_at = cache / f"{commit[:12]}-{key}.json" if cache else None
-    if kept_at and kept_at.exists():
-        return json.loads(kept_at.read_text(encoding="utf-8"))
-    with tempfile.TemporaryDirectory() as temporary:
-        answers = answers_of(unpack(commit, Path(temporary)), chosen)
-    if kept_at:
-        kept_at.parent.mkdir(parents=True, exist_ok=True)
-        kept_at.write_text(json.dumps(answers), encoding="utf-8")
+class Kept:
+    """Keep the answers of an old commit in a folder, by case and by the commands before it."""
+
+    def __init__(self, folder: Path, commit: str, chosen: list[Case], data: Path) -> None:
+        self._paths = dict[str, Path]()
+        digest = hashlib.sha256()
+        for case in chosen:
+            words = repr((case.prepare, asdict(case)))
+            digest.update(words.replace(str(ROOT), "ROOT").replace(str(data), "DATA").encode())
+            name = case.name.replace(", ", "-").replace(" ", "-")
+            self._paths[case.name] = folder / f"{commit[:12]}-{name}-{digest.hexdigest()[:12]}.json"
+
+    def read(self) -> Answers:
+        """Return the answers that are there."""
+        return {
+            name: json.loads(path.read_text(encoding="utf-8"))
+            for name, path in self._paths.items()
+            if path.exists()
+        }
+
+    def write(self, answers: Answers) -> None:
+        """Add answers."""
+        for name, found in answers.items():
+            self._paths[name].parent.mkdir(parents=True, exist_ok=True)
+            self._paths[name].write_text(json.dumps(found), encoding="utf-8")
+
+
+def old_answers(
+    tree: Path, chosen: list[Case], wanted: list[str], cache: Kept | None, is_full: bool
+) -> Answers:
+    """Return the answers of an old source tree, from the cache if they are there."""
+    answers = cache.read() if cache else {}
+    missing = [name for name in wanted if name not in answers]
+    if missing:
+        found = answers_of(tree, chosen, missing, is_full)
+        answers |= found
+        if cache:
+            cache.write(found)
     return answers
 
 
 def line(name: str, found: Comparison) -> str:
     """Return one line of the table."""
     largest = f"{found.position:9.1e} {found.angle:9.1e} {found.probability:9.1e}"
-    return f"{name:14} {found.compared:7} {found.different:9} {largest}  {found.first}"
+    largest += f" {found.covariance:10.1e}"
+    return f"{name:26} {found.compared:7} {found.different:9} {largest}  {found.first}"
+
+
+def compare_trees(
+    arguments: argparse.Namespace, commit: str, old: Path, data: Path
+) -> dict[str, Comparison]:
+    """Return the comparison of each wanted case."""
+    is_full = has_last_step(old)
+    chosen = cases(data, arguments.quick, is_full)
+    names = [case.name for case in chosen]
+    wanted = arguments.only or names
+    chosen = chosen[: max(names.index(name) for name in wanted) + 1]
+    cache = Kept(arguments.cache, commit, chosen, data) if arguments.cache else None
+    before = old_answers(old, chosen, wanted, cache, is_full)
+    now = answers_of(arguments.tree.resolve(), chosen, wanted, is_full)
+    return {name: compare_answers(before[name], now[name]) for name in names if name in wanted}
 
 
 def main() -> int:
@@ -165,27 +166,26 @@ def main() -> int:
     )
     parser.add_argument("old_commit")
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--tree", type=Path, default=ROOT, help="source tree with new answers")
     shared = Path(os.environ.get("TOPOLOC_SHARED", ROOT.parent / "shared"))
     parser.add_argument("--shared", type=Path, default=shared)
     parser.add_argument("--cache", type=Path)
-    parser.add_argument("--only", help="a case; those whose maps it needs run, too")
+    parser.add_argument("--only", action="append", metavar="CASE", help="several times: several")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     git = ["git", "-C", str(ROOT), "rev-parse", "--verify", f"{arguments.old_commit}^{{commit}}"]
     commit = subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
-    chosen = cases((arguments.shared / "data").resolve(), arguments.quick)
-    if arguments.only:
-        names = [case.name for case in chosen]
-        chosen = chosen[: names.index(arguments.only) + 1]
+    data = (arguments.shared / "data").resolve()
     try:
-        old = old_answers(commit, chosen, arguments.cache)
-        new = answers_of(ROOT, chosen)
+        with tempfile.TemporaryDirectory() as temporary:
+            old = unpack(commit, Path(temporary))
+            found = compare_trees(arguments, commit, old, data)
     except JobError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    found = {case.name: compare_answers(old[case.name], new[case.name]) for case in chosen}
-    print(f"old {commit[:12]}, new {ROOT}")
-    print("case           answers different         m       rad         p  first difference")
+    print(f"old {commit[:12]}, new {arguments.tree.resolve()}")
+    columns = f"answers different {'m':>9} {'rad':>9} {'p':>9} {'covariance':>10}"
+    print(f"{'case':26} {columns}  first difference")
     for name, comparison in found.items():
         print(line(name, comparison))
     if arguments.json:

@@ -24,9 +24,8 @@ import numpy as np
 from real_recordings import PLACES, Place
 from topoloc.apps.cli.features_option import open_localizer
 from topoloc.demo.recordings import SHIPPED
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.evidence import compute_translation_tolerance
 from topoloc.localization.localizer import Localizer, LocalizerConfig

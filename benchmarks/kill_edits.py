@@ -32,8 +32,9 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.mapping.edit import edit_map, find_kept_files, undo_edit
+from topoloc.mapping.edit import edit_map, undo_edit
 from topoloc.mapping.storage.integrity_check import find_map_damage
+from topoloc.mapping.storage.kept_files import find_kept_files
 
 
 def edit_without_end(path: Path) -> None:

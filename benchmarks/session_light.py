@@ -32,7 +32,7 @@ from topoloc.mapping.coarse_models import (
     group_by_illumination,
 )
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.sessions import (
+from topoloc.mapping.storage.entries import (
     Illumination,
     Session,
     average_illumination,

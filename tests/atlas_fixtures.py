@@ -1,5 +1,4 @@
-"""A second small map, and buckets of an S3 server on this machine, for tests of atlases and
-stores."""
+"""Provide a second small map and buckets of a local S3 server, for tests of atlases and stores."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ from topoloc.recordings.open import open_sequence
 
 @pytest.fixture(scope="session")
 def other_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map of another room, of half as many pairs."""
+    """Return the map of another room, made from half as many pairs."""
     from tiny_world import write_stereo_recording
 
     folder = tmp_path_factory.mktemp("other")
@@ -31,7 +30,7 @@ def other_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def s3_server() -> Iterator[str]:
-    """The address of moto's server, which speaks the API of Amazon S3, on this machine."""
+    """Return the address of a local moto server, which has the API of Amazon S3."""
     for needed in ("obstore", "moto", "flask", "flask_cors"):
         pytest.importorskip(
             needed,
@@ -48,7 +47,7 @@ def s3_server() -> Iterator[str]:
 
 @pytest.fixture
 def s3_bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
-    """A new bucket, `s3://...`; files that are read of it are kept in a folder of the test."""
+    """Return a new bucket, `s3://...`. Files read from it are cached in a folder of the test."""
     said = {"AWS_ENDPOINT_URL": s3_server, "AWS_DEFAULT_REGION": "us-east-1"}
     said |= {
         "AWS_ACCESS_KEY_ID": "tests",

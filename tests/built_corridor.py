@@ -1,9 +1,9 @@
-"""A corridor walked in one direction, as a map, and pictures of its way back; each made once a test
+"""Map a corridor in one direction, and render images of the reverse direction, each once per test
 run.
 
 Its walls run along the world's +y, 2.2 m apart, with the textures of `tiny_world`, above a plain
-floor: who comes back sees the same walls at the opposite slant, and nothing else that the map
-knows.
+floor. In reverse direction a camera sees the same walls at the opposite slant, and nothing else of
+the map.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NUM_PAIRS, STEP = 14, 0.3
 
 @cache
 def corridor(seed: int = 0) -> list[Panel]:
-    """Two walls, a floor and two ends; another seed is another place of the same shape."""
+    """Return two walls, a floor and two ends. Another seed is another place of the same shape."""
     floor = np.full((2, 2), 90.0, np.float32)
     up_down, along = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
     shapes = [
@@ -54,13 +54,13 @@ def corridor(seed: int = 0) -> list[Panel]:
 
 
 def ahead(y: float, x: float = 0.0, yaw: float = 0.0) -> Rigid3:
-    """world_from_cam in the mapped direction, `y` metres along the corridor, turned to the left by
-    `yaw` radians."""
+    """Return world_from_cam in the mapped direction, `y` metres along the corridor, rotated to the
+    left by `yaw` radians."""
     return Rigid3(exp_so3(np.array([0.0, 0.0, yaw])) @ LEVEL_FROM_CAM, np.array([x, y, 0.0]))
 
 
 def back(y: float, x: float = 0.0, yaw: float = 0.0) -> Rigid3:
-    """world_from_cam of the way back."""
+    """Return world_from_cam in reverse direction."""
     return ahead(y, x, np.pi + yaw)
 
 
@@ -70,8 +70,8 @@ def _walking(number: int) -> Rigid3:
 
 @cache
 def _seen_from(seed: int, number: int, side: int, camera: Camera) -> np.ndarray:
-    """What the left (0) or right (1) camera of a pair of the walk sees; a map is built from several
-    passes over the recording."""
+    """Return the image of the left (0) or right (1) camera of a pair. It is cached, because a build
+    reads a recording several times."""
     pose = _walking(number)
     return render(
         corridor(seed), right_pose(pose) if side else pose, camera, noise_seed=2 * number + side
@@ -80,7 +80,7 @@ def _seen_from(seed: int, number: int, side: int, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class WalkAhead:
-    """A recording of stereo pairs from the corridor's one end towards the other."""
+    """Hold a recording of stereo pairs from one end of the corridor towards the other."""
 
     seed: int
     name: str = "walk"
@@ -119,19 +119,21 @@ class WalkAhead:
 
 @once_a_run
 def built_corridor() -> TopoMetricMap:
-    """The map of the walk ahead, with side nodes, of SURF alone."""
+    """Return the map of the walk ahead, with virtual views, of SURF alone."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=()))
 
 
 @once_a_run
 def corridor_of_two_kinds() -> TopoMetricMap:
-    """The same, of SURF and the learned features at hand, which describe the side nodes."""
+    """Return the same map of SURF and the shipped learned features, which also describe the
+    virtual views."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=(default_learned_type(),)))
 
 
 @cache
 def seen_on_the_way_back(seed: int = 0) -> list[tuple[np.ndarray, Rigid3]]:
-    """Grey pictures of WIDE, with world_from_cam; another seed is another corridor."""
+    """Return grey images of WIDE in reverse direction, with world_from_cam. Another seed is
+    another corridor."""
     poses = [
         back(y, x=0.15 * np.sin(y), yaw=0.05 * np.cos(3.0 * y)) for y in np.arange(4.0, 7.1, 0.6)
     ]
@@ -143,7 +145,7 @@ def seen_on_the_way_back(seed: int = 0) -> list[tuple[np.ndarray, Rigid3]]:
 
 @cache
 def seen_ahead() -> list[tuple[np.ndarray, Rigid3]]:
-    """Grey pictures of WIDE in the mapped direction, between the frames of the map."""
+    """Return grey images of WIDE in the mapped direction, between the frames of the map."""
     poses = [ahead(y, x=0.1, yaw=-0.03) for y in (0.5, 2.0, 3.8)]
     return [
         (render(corridor(), pose, WIDE, noise_seed=700 + k)[0], pose)

@@ -1,5 +1,4 @@
-"""The rendered room of `tiny_world` as a map, and pictures of it that the map has not seen; each
-made once a test run."""
+"""Map the rendered room of `tiny_world`, and render new images of it, each once per test run."""
 
 from __future__ import annotations
 
@@ -21,26 +20,26 @@ from topoloc.recordings.open import open_sequence
 
 @once_a_run
 def recorded_room(folder: Path) -> Path:
-    """The recording `tiny_recording`."""
+    """Return the recording `tiny_recording`."""
     return write_stereo_recording(folder)
 
 
 @once_a_run
 def built_room(recording: Path) -> TopoMetricMap:
-    """The map of the recording `tiny_recording`, of SURF alone."""
+    """Return the map of the recording `tiny_recording`, of SURF alone."""
     return build_map(open_sequence(recording), BuildConfig(other_kinds=()))
 
 
 @once_a_run
 def room_of_two_kinds(recording: Path) -> TopoMetricMap:
-    """A map of every other pair, of SURF and SIFT."""
+    """Return a map of every other pair, of SURF and SIFT."""
     return build_map(open_sequence(f"{recording}@0::2"), BuildConfig(other_kinds=("sift",)))
 
 
 @cache
 def unseen_views(seed: int = 0, step: float = 1.5) -> list[tuple[np.ndarray, Rigid3]]:
-    """Grey pictures of CAMERA taken between the frames of the recording, with world_from_cam;
-    another seed is another world."""
+    """Return grey images of CAMERA between the frames of the recording, with world_from_cam.
+    Another seed is another world."""
     panels = room(seed)
     indices = np.arange(0.5, 13.0, step)
     return [
@@ -50,7 +49,8 @@ def unseen_views(seed: int = 0, step: float = 1.5) -> list[tuple[np.ndarray, Rig
 
 
 def write_pictures(folder: Path, views: list[tuple[np.ndarray, Rigid3]]) -> Path:
-    """The views as a folder of pictures with camera.json, times and truth; returns `folder`."""
+    """Write the views as a folder of images with camera.json, times and truth, and
+    return `folder`."""
     folder.mkdir(parents=True)
     for number, (picture, _) in enumerate(views):
         assert cv2.imwrite(str(folder / f"view{number:02d}.png"), picture)

@@ -1,5 +1,4 @@
-"""Shapes in the annotations are checked at run time in every test; the recordings beside the
-project are found here."""
+"""Check shapes of annotations in each test, and find the recordings beside the project."""
 
 from __future__ import annotations
 
@@ -22,8 +21,8 @@ from topoloc import compiled
 
 
 def _modules_with_checked_shapes() -> list[str]:
-    """All leaf modules but the Numba kernels, whose compiler cannot take a wrapped function, and
-    messages whose types DDS reads itself."""
+    """Return all leaf modules except Numba kernels, which cannot be wrapped, and messages whose
+    types DDS reads itself."""
     packages = (topoloc, topoloc_worlds, topoloc_training, topoloc_paper)
     modules = [
         m
@@ -47,7 +46,7 @@ SHARED = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shar
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of real recordings and reference values."""
+    """Return the folder of real recordings and reference values."""
     if not (SHARED / "data").is_dir():
         pytest.skip(f"no recordings at {SHARED} (set TOPOLOC_SHARED)")
     return SHARED
@@ -65,7 +64,7 @@ def threads_of_the_process_are_restored() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def no_networks_but_the_tests_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """An empty cache: what a test finds does not depend on what its user has fetched."""
+    """Set an empty cache, so that tests do not depend on networks that the user downloaded."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TOPOLOC_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -73,7 +72,7 @@ def no_networks_but_the_tests_own(tmp_path_factory: pytest.TempPathFactory) -> I
 
 @pytest.fixture(scope="session", autouse=True)
 def of_all_workers(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder for what all processes of this test run read."""
+    """Create a folder of files that all processes of this test run read."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "of-all-workers"
     folder.mkdir(exist_ok=True)
@@ -83,10 +82,10 @@ def of_all_workers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_recording(of_all_workers: Path) -> Path:
-    """A small rendered room as a stereo recording (KITTI-like, 14 pairs of 320x240) with exact
-    truth.tum and a camera.json.
+    """Return a small rendered room as a stereo recording (KITTI-like, 14 pairs of 320x240) with
+    exact truth.tum and a camera.json.
 
-    Not to be written to: all tests share it. `tiny_world` renders more of the same place, or
+    It is read-only, because all tests share it. `tiny_world` renders more of the same place, or
     others.
     """
     from built_room import recorded_room  # after the hook above
@@ -96,7 +95,7 @@ def tiny_recording(of_all_workers: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def room_map(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map of `tiny_recording`, of SURF alone; not to be written to."""
+    """Return the map of `tiny_recording`, of SURF alone. Read-only."""
     from built_room import built_room
 
     path = tmp_path_factory.mktemp("map") / "room.topo"
@@ -106,7 +105,7 @@ def room_map(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="session")
 def queries(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of pictures of the room, with calibration and truth; not to be written to."""
+    """Return a folder of images of the room, with calibration and truth. Read-only."""
     from built_room import unseen_views, write_pictures
 
     return write_pictures(tmp_path_factory.mktemp("queries") / "unseen", unseen_views())
@@ -114,8 +113,8 @@ def queries(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """Runs a command that must fail: its one line on stderr. No file may appear, change size or
-    go."""
+    """Return a function that runs a failing command and returns its one line on stderr. The command
+    may not create, resize or delete a file."""
     from topoloc.apps.cli import main  # after the hook above
 
     def run(*args: object, status: int = 1) -> str:
@@ -134,7 +133,7 @@ def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...
 
 @pytest.fixture(autouse=True)
 def loggers_of_the_service_are_plain() -> Iterator[None]:
-    """Undo what hides records from `caplog`: `topoloc serve` sets loggers up, and import-linter
+    """Restore loggers for `caplog`: `topoloc serve` configures them, and import-linter
     disables them."""
     yield
     for name in ("topoloc.apps.service", "uvicorn", "asyncio"):

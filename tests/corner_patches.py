@@ -1,7 +1,8 @@
-"""A third kind of features in one file: FAST corners, described by the 64 grey levels of their
+"""Define a third feature type in one file: FAST corners, described by the 64 grey levels of their
 neighbourhood.
 
-It has neither scale nor angle, and finds corners to a pixel only, as many learned kinds do.
+It has neither scale nor angle, and locates corners to a pixel only, like many learned feature
+types.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ _PATCH_PX, _CELLS = 24, 8
 def extract_corner_patches(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int
 ) -> Features:
-    """Corners of a grey image, strongest first; the mean is taken off each patch, which then gets
-    unit length."""
+    """Extract corners of a grey image, strongest first. Each patch has zero mean
+    and unit length."""
     corners = cv2.FastFeatureDetector_create(threshold=8).detect(image)  # pyright: ignore[reportAttributeAccessIssue]
     table = np.array([(*corner.pt, corner.response) for corner in corners], np.float32).reshape(
         -1, 3

@@ -1,4 +1,4 @@
-"""A map that holds one room twice, for tests of places that look alike."""
+"""Make a map that contains one room twice, for tests of similar places."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def _moved(node: TopoNode, node_id: int) -> TopoNode:
 
 
 def twice(topomap: TopoMetricMap, share_alike: float = 1.0) -> TopoMetricMap:
-    """A map that holds the room a second time, elsewhere; only this share of its points looks the
-    same there."""
+    """Return a map with a second copy of the room elsewhere. Only this share of its points
+    looks the same."""
     num_nodes, rng = len(topomap.nodes), np.random.default_rng(0)
     copies = []
     for node in topomap.nodes:

@@ -1,5 +1,4 @@
-"""A small map and answers put together by hand, so that every number of an evaluation is known
-beforehand."""
+"""Make a small map and results by hand, so that each figure of an evaluation is known."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ def answer(
     node_id: int = 0,
     first_candidate: int = 0,
 ) -> EvaluatedQuery:
-    """A query at `x` that was localized, off by this much; its nearest node is 0."""
+    """Return a localized query at `x` with this error. Its nearest node is 0."""
     off = Rigid3(
         exp_so3(np.array([np.deg2rad(error_deg), 0.0, 0.0])), np.array([0.0, 0.0, error_m])
     )
@@ -50,13 +49,13 @@ def answer(
 
 
 def lost(query: str, x: float, reason: str = "too_few_inliers") -> EvaluatedQuery:
-    """A query at `x` without a pose."""
+    """Return a query at `x` without a pose."""
     result = NotLocalized(reason, [CandidateNode(1, 0.2)], 9, 3, TIMES_MS)  # pyright: ignore[reportArgumentType]
     return EvaluatedQuery(query, result, pose(x), 0, "walk", picture)
 
 
 def elsewhere(query: str, accepted: bool) -> EvaluatedQuery:
-    """An image from elsewhere."""
+    """Return an out-of-map image."""
     if accepted:
         result = Localization(
             pose(0.0), np.eye(6), 0.9, 1, [CandidateNode(1, 0.3)], 12, 12, TIMES_MS
@@ -77,7 +76,7 @@ def picture() -> np.ndarray:
 
 
 def two_nodes() -> TopoMetricMap:
-    """Nodes at x = 0 and x = 1."""
+    """Return a map with nodes at x = 0 and x = 1."""
     camera = Camera.pinhole(40, 30, 30.0, 30.0, 19.5, 14.5)
     jpeg = cv2.imencode(".jpg", np.full((30, 40), 90, np.uint8))[1].tobytes()
     none = np.zeros(0, np.float32)

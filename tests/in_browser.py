@@ -1,5 +1,5 @@
-"""Pages in a real browser without a window: Chromium, driven by Playwright. Tests skip with a
-reason where either is missing."""
+"""Open pages in a headless Chromium, driven by Playwright. If either is missing, tests skip
+with a reason."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ UNNAMED = """() => [...document.querySelectorAll("button, input:not([hidden]), s
 
 @contextmanager
 def chromium(*options: str) -> Iterator[Any]:
-    """The browser, as Playwright's `Browser`."""
+    """Yield the browser as Playwright's `Browser`."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = next(
         (
@@ -65,8 +65,8 @@ def chromium(*options: str) -> Iterator[Any]:
 
 @contextmanager
 def opened(browser: Any, address: str, width: int, dark: bool = False) -> Iterator[Any]:
-    """The page at this address in a window so many pixels wide; whatever it says on its console as
-    an error fails the test."""
+    """Open the page in a window of this width in pixels. Any error or warning on its console
+    fails the test."""
     page = browser.new_page(
         viewport={"width": width, "height": 800}, color_scheme="dark" if dark else "light"
     )

@@ -1,5 +1,5 @@
-"""What takes long to make and is only read: the first process of a test run that asks for it makes
-it, the others read its file."""
+"""Cache slow results that tests only read: the first process of a test run makes one, and others
+read its file."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ _folder: list[Path] = []
 
 
 def share_in(folder: Path) -> None:
-    """From now on what `once_a_run` makes lies in this folder, which all processes of the run
-    name."""
+    """Set the folder for the results of `once_a_run`, which all processes of the run share."""
     _folder[:] = [folder]
 
 
 def once_a_run(make: Callable[P, R]) -> Callable[P, R]:
-    """Decorates a function whose arguments print alike in all processes and whose result can be
-    pickled; a process calls it once."""
+    """Cache a function. Its arguments must print equally in all processes, and its result
+    must be picklable."""
 
     @functools.cache
     def made(*args: P.args, **settings: P.kwargs) -> R:

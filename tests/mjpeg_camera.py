@@ -1,4 +1,4 @@
-"""A camera as many are: JPEG pictures one after the other over HTTP, from this machine."""
+"""Serve JPEG images one after the other over HTTP on this machine, like many network cameras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 def mjpeg_camera(
     pictures: Sequence[np.ndarray], period_s: float, hangs: bool = False
 ) -> Iterator[str]:
-    """Its URL. Each picture (grey or BGR) comes once; then the stream ends, or `hangs`."""
+    """Yield the URL. Each image (grey or BGR) is sent once. Then the stream ends, or `hangs`."""
     ended = threading.Event()
     data = [
         cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()

@@ -1,5 +1,5 @@
-"""The peak memory of a program that a test starts. `ru_maxrss` would begin with that of the process
-of the test, which other tests have filled."""
+"""Measure the peak memory of a program that a test starts. `ru_maxrss` would include the test
+process, whose memory other tests have filled."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""A robot that exists in messages alone: it publishes images, camera_info and TF over DDS in real
-time, as a robot's drivers do, and hears what a localizer publishes.
+"""Simulate a robot by messages. As drivers do, it publishes images, camera_info and TF over DDS in
+real time. It also receives the messages of a localizer.
 
-Its odometry drifts: it takes each way for 2 % longer, and turns half a degree a metre to the left.
+Its odometry drifts: it measures 2 % too much distance, and turns half a degree per metre to the
+left.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ BASE_FROM_CAM = STATIC["base_link", "camera_link"] @ STATIC["camera_link", "came
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Where the camera is, what it sees, and whether it was carried there, unseen by odometry."""
+    """Hold the camera pose, its image, and whether the camera was moved without odometry."""
 
     world_from_cam: Rigid3
     picture: np.ndarray
@@ -52,8 +53,9 @@ class Step:
 
 @dataclass(eq=False)
 class Heard:
-    """What was heard: TF from map to odom as (arrival, stamp, pose), poses of the robot as
-    (arrival, stamp, pose), statuses as (arrival, level, text, values). Arrivals are nanoseconds."""
+    """Store received messages: TF from map to odom as (arrival, stamp, pose), robot poses
+    as (arrival, stamp, pose), and statuses as (arrival, level, text, values). Arrivals
+    are nanoseconds."""
 
     transforms: list[tuple[int, int, Rigid3]] = field(default_factory=list)
     others: list[tuple[str, int, Rigid3]] = field(default_factory=list)
@@ -61,7 +63,7 @@ class Heard:
     statuses: list[tuple[int, int, str, dict[str, str]]] = field(default_factory=list)
 
     def map_from_odom(self, t_ns: int) -> Rigid3 | None:
-        """The transform at a time, as tf2 interpolates it."""
+        """Interpolate the transform at a time as tf2 does."""
         stamps = [stamp for _, stamp, _ in self.transforms]
         after = int(np.searchsorted(stamps, t_ns))
         if after in (0, len(stamps)):
@@ -71,7 +73,7 @@ class Heard:
 
 
 class PlayedRobot:
-    """A robot in a ROS domain. `hz` images a second are played, one a step."""
+    """Simulate a robot in a ROS domain. It plays `hz` images per second, one per step."""
 
     def __init__(self, camera: Camera, domain: int, hz: float = 10.0) -> None:
         self.camera, self.hz, self.heard = camera, hz, Heard()
@@ -99,7 +101,7 @@ class PlayedRobot:
         self._node.close()
 
     def wait_for_listener(self, seconds: float) -> bool:
-        """Wait until somebody reads the images."""
+        """Wait until a reader of the images is connected."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if self._image.get_matched_subscriptions():
@@ -108,7 +110,7 @@ class PlayedRobot:
         return False
 
     def stand(self, step: Step, until: Callable[[], bool], seconds: float) -> bool:
-        """Play a step until something is heard, and then half a second more."""
+        """Play one step until the condition is true, and then half a second more."""
         end = time.monotonic() + seconds
         while not until() and time.monotonic() < end:
             self.play([step] * 5)
@@ -117,7 +119,7 @@ class PlayedRobot:
         return until()
 
     def play(self, steps: Sequence[Step]) -> None:
-        """Drive. Truth and odometry of this drive can be asked for afterwards."""
+        """Drive the steps, and keep the truth and odometry of this drive."""
         odom = self.odometry[-1] if self.odometry else BASE_FROM_CAM
         self.odometry, self.steps = [odom], list(steps)
         for before, after in pairwise(steps):
@@ -145,8 +147,8 @@ class PlayedRobot:
         return self.start_ns + round((len(self.steps) - 1) * 1e9 / self.hz)
 
     def errors(self, first: int = 0, last: int | None = None) -> np.ndarray:
-        """Metres by which the camera in TF (map, odom, base, camera) is off, fifty times a second
-        between two steps."""
+        """Return the position errors in metres of the camera in TF (map, odom, base, camera), fifty
+        per second, between two steps."""
         last = len(self.steps) - 1 if last is None else last
         found = list[float]()
         for t in np.arange(first / self.hz, last / self.hz, 1.0 / TF_HZ):
@@ -158,7 +160,7 @@ class PlayedRobot:
         return np.array(found)
 
     def pose_errors(self) -> np.ndarray:
-        """Metres by which the published poses of the robot are off."""
+        """Return the position errors in metres of the published robot poses."""
         found = list[float]()
         for _, stamp, map_from_base in self.heard.poses:
             if self.start_ns <= stamp <= self.end_ns():
@@ -167,15 +169,15 @@ class PlayedRobot:
         return np.array(found)
 
     def latencies(self) -> np.ndarray:
-        """Seconds from the stamp of an image to its pose."""
+        """Return the seconds from the stamp of each image to its pose."""
         return np.array([(at - stamp) / 1e9 for at, stamp, _ in self.heard.poses])
 
     def gaps(self) -> np.ndarray:
-        """Seconds between transforms from map to odom."""
+        """Return the seconds between transforms from map to odom."""
         return np.diff([at for at, _, _ in self.heard.transforms]) / 1e9
 
     def make_initial_pose(self, map_from_base: Rigid3) -> Any:
-        """The message of RViz's tool 2D Pose Estimate."""
+        """Return the message of RViz's tool 2D Pose Estimate."""
         ros = self.ros
         ((stamped,),) = [self._message([("map", "", map_from_base)], time.time_ns()).transforms]
         place = stamped.transform.translation
@@ -261,7 +263,8 @@ class PlayedRobot:
 def followed(
     topomap: Path, domain: int, *options: str, stdout: Any = subprocess.DEVNULL
 ) -> Iterator[subprocess.Popen[str]]:
-    """`topoloc follow MAP ros:/camera/image_raw --ros`, as a user types it, in its own process."""
+    """Run `topoloc follow MAP ros:/camera/image_raw --ros` in its own process, as a
+    user types it."""
     command = [sys.executable, "-m", "topoloc", "follow", str(topomap), f"ros:{IMAGE_TOPIC}"]
     environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
     with subprocess.Popen(
@@ -278,7 +281,7 @@ def followed(
 
 
 def _drifted(motion: Rigid3) -> Rigid3:
-    """The motion of a camera as the odometry measures it, which turns about the robot's z."""
+    """Return the motion of a camera as odometry measures it, with rotation about the robot's z."""
     base_motion = BASE_FROM_CAM @ motion @ BASE_FROM_CAM.inverse()
     way = float(np.linalg.norm(base_motion.translation))
     turn = exp_so3(np.array([0.0, 0.0, TURN_PER_METRE * way]))

@@ -1,4 +1,4 @@
-"""Tiny recordings of every format, with known pictures, times and poses."""
+"""Provide tiny recordings of each format, with known images, times and poses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tiny_recordings import (
 
 @pytest.fixture
 def kitti(tmp_path: Path) -> Path:
-    """Three grey pairs at 0, 0.1, 0.2 s, with KITTI's poses beside `sequences`."""
+    """Return three grey pairs at 0, 0.1, 0.2 s, with KITTI's poses beside `sequences`."""
     folder = tmp_path / "sequences" / "07"
     for index in range(3):
         write(folder / "image_0" / f"{index:06d}.png", picture(index))
@@ -43,8 +43,8 @@ def kitti(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def euroc(tmp_path: Path) -> Path:
-    """Four pairs 50 ms apart; cam1 lacks the second picture. The body's truth is at the times of
-    the first and last two."""
+    """Return four pairs 50 ms apart. The second image of cam1 is missing. The body's truth is at
+    the times of the first and last two."""
     for camera in (0, 1):
         folder = tmp_path / "v1" / "mav0" / f"cam{camera}"
         rows = ["#timestamp [ns],filename"]
@@ -60,7 +60,8 @@ def euroc(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tum(tmp_path: Path) -> Path:
-    """Three colour pictures, the second without depth near enough, and truth at all times."""
+    """Return three colour images with truth at all times. The second has no depth image near
+    enough in time."""
     folder = tmp_path / "rgbd_dataset_freiburg1_tiny"
     times = ["1305031102.175304", "1305031102.211214", "1305031102.275326"]
     depths = ["1305031102.160407", "1305031102.236000", "1305031102.280000"]
@@ -81,7 +82,7 @@ def tum(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def seven_scenes(tmp_path: Path) -> Path:
-    """A scene with one run of two frames, 0 and 3."""
+    """Return a scene with one run of two frames, 0 and 3."""
     folder = tmp_path / "office" / "seq-01"
     for number in (0, 3):
         stem = f"frame-{number:06d}"
@@ -95,8 +96,8 @@ def seven_scenes(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def plain(tmp_path: Path) -> Callable[..., Path]:
-    """Makes a folder of three pictures in each of the folders named, with a camera.json of CAMERA
-    and these keys, if any."""
+    """Return a function that writes three images to each named folder, and a camera.json of CAMERA
+    with these keys, if any."""
 
     def make(*folders: str, **camera_keys: float) -> Path:
         root = tmp_path / "plain"
@@ -117,6 +118,6 @@ def plain(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def quiet(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
-    """Nothing, not even a library's own message, was written to stderr."""
+    """Check that nothing was written to stderr, not even by a library."""
     yield
     assert capfd.readouterr().err == ""

@@ -1,5 +1,5 @@
-"""Frames of the rendered room without files: a camera that goes wherever a test wants it, and is
-made to fail on the way."""
+"""Render frames of the room in memory: the camera goes to any place, and tests can
+damage frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RIG = StereoRig.rectified(tiny_world.CAMERA, tiny_world.BASELINE)
 
 @dataclass(frozen=True, eq=False)
 class FrameList:
-    """A StereoSequence in memory."""
+    """Hold a StereoSequence in memory."""
 
     frames: Sequence[StereoFrame]
     name: str = "room"
@@ -45,7 +45,7 @@ class FrameList:
 
 @cache
 def stereo_frame(place: float, seed: int = 0) -> StereoFrame:
-    """The pair at this place of the path, with truth."""
+    """Return the pair at this place of the path, with truth."""
     panels, pose = tiny_world.room(seed), tiny_world.path_pose(place)
     noise = round(1000 * place)
     left, right = (
@@ -60,14 +60,14 @@ def stereo_frame(place: float, seed: int = 0) -> StereoFrame:
 
 @cache
 def depth_frame(place: float) -> StereoFrame:
-    """The same with depth instead of the right picture."""
+    """Return the same frame with depth instead of the right image."""
     _, depth = tiny_world.render(tiny_world.room(), tiny_world.path_pose(place))
     measured = DepthImage(depth.astype(np.float32), tiny_world.CAMERA, Rigid3.identity())
     return replace(stereo_frame(place), right=None, rig=None, depth=measured)
 
 
 def walk(places: Sequence[float], seed: int = 0, name: str = "room") -> FrameList:
-    """Frames at these places, a tenth of a second after each other."""
+    """Return frames at these places, a tenth of a second apart."""
     frames = [
         replace(stereo_frame(float(place), seed), t_ns=i * 100_000_000)
         for i, place in enumerate(places)
@@ -76,13 +76,13 @@ def walk(places: Sequence[float], seed: int = 0, name: str = "room") -> FrameLis
 
 
 def changed(sequence: FrameList, frames: dict[int, StereoFrame]) -> FrameList:
-    """The same recording with some frames replaced."""
+    """Return the same recording with some frames replaced."""
     return FrameList(
         [frames.get(i, frame) for i, frame in enumerate(sequence.frames)], sequence.name
     )
 
 
 def blackened(frame: StereoFrame) -> StereoFrame:
-    """No light."""
+    """Return the frame without light."""
     assert frame.right is not None
     return replace(frame, image=np.zeros_like(frame.image), right=np.zeros_like(frame.right))

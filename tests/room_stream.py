@@ -1,5 +1,5 @@
-"""The rendered room of `tiny_world` as a stream: thirty pictures a second along its path, with
-exact truth."""
+"""Render the room of `tiny_world` as a stream: thirty images per second along its path,
+with exact truth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NUM_PICTURES = 40
 
 @cache
 def room_stream() -> list[tuple[int, np.ndarray, Rigid3]]:
-    """(t_ns, grey picture, world_from_cam) along the path, about two centimetres a picture."""
+    """Return (t_ns, grey image, world_from_cam) along the path, about two centimetres per image."""
     panels = room()
     poses = [path_pose(2.0 + 0.15 * number) for number in range(NUM_PICTURES)]
     return [
@@ -27,7 +27,7 @@ def room_stream() -> list[tuple[int, np.ndarray, Rigid3]]:
 
 @cache
 def far_away(num: int = 5) -> list[tuple[np.ndarray, Rigid3]]:
-    """Pictures of the far end of the path, 0.8 m and more from where the stream begins."""
+    """Return images of the far end of the path, at least 0.8 m from the start of the stream."""
     panels = room()
     poses = [path_pose(10.5 + 0.1 * number) for number in range(num)]
     return [

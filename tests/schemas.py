@@ -1,4 +1,4 @@
-"""The published schema of results, the rules of OGC GeoPose, and data held against them."""
+"""Check data against the published schema of results and the rules of OGC GeoPose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NUMBER = {"type": "number"}
 
 
 def strict_object(**members: Any) -> dict[str, Any]:
-    """The schema of an object with exactly these members."""
+    """Return the schema of an object with exactly these members."""
     names = {"required": list(members), "properties": members}
     return {"type": "object", "additionalProperties": False} | names
 
@@ -38,14 +38,14 @@ GEOPOSE_YPR = strict_object(
 
 
 def check_geopose(data: Any) -> None:
-    """A Basic-Quaternion GeoPose in the strict form, of unit length."""
+    """Check a Basic-Quaternion GeoPose in strict form, with unit length."""
     Draft202012Validator(GEOPOSE).validate(data)
     length = sum(value**2 for value in data["quaternion"].values()) ** 0.5
     assert abs(length - 1.0) < 1e-6
 
 
 def check_result(line: dict[str, Any]) -> None:
-    """A line that the schema allows for, and that has no key that it does not know."""
+    """Check that a line follows the schema and has no unknown key."""
     Draft202012Validator(SCHEMA).validate(line)
     for one in (line, *line.get("alternatives", ())):
         if "geopose" in one:

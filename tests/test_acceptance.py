@@ -1,4 +1,5 @@
-"""Run a part of `make acceptance`: old files, the figures of the demo, the rules of comparison."""
+"""Test parts of `make acceptance`: old files, the figures of the demo, and the rules
+of comparison."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -54,6 +56,7 @@ def test_verdicts(jobs: Any):
     assert [verdict("at most", 1, now) for now in (2, 1, 0)] == ["worse", "same", "better"]
     assert [verdict("median", 1.0, now) for now in (1.06, 1.04, 0.9)] == ["worse", "same", "better"]
     assert [verdict("time", 1.0, now) for now in (1.3, 1.1, 0.7)] == ["worse", "same", "better"]
+    assert [verdict("budget", 100, now) for now in (104, 103, 96)] == ["worse", "same", "better"]
     assert [verdict("equal", "a", now) for now in ("a", "b")] == ["same", "worse"]
 
 
@@ -83,26 +86,46 @@ def test_answers_that_differ_are_found(jobs: Any):
     assert answers.compare_answers(old, old).different == 0
     moved, other = json.loads(json.dumps(old)), json.loads(json.dumps(old))
     moved[0]["world_from_cam"]["translation"][1] += 2e-6
+    for answers_now, factor in ((old, 1.0), (other, 1.0 + 3e-6)):
+        answers_now[2]["covariance"] = (factor * np.diag([1.0, 4.0, 9.0, 1.0, 1.0, 1.0])).tolist()
     other[1]["node"] += 1
     del other[4]
     found = answers.compare_answers(old, moved)
     assert (found.different, round(found.position, 9)) == (1, 2e-6)
-    assert answers.compare_answers(old, other).different == 2
+    found = answers.compare_answers(old, other)
+    assert (found.different, round(found.covariance, 9)) == (3, 3e-6)
     turned = {"translation": [0.0, 0.0, 0.0], "quat_wxyz": [1.0, 1e-6, 0.0, 0.0]}
     straight = {"translation": [0.0, 0.0, 0.0], "quat_wxyz": [-1.0, 0.0, 0.0, 0.0]}
     assert answers.pose_difference(straight, turned) == pytest.approx((0.0, 2e-6))
 
 
-def test_a_part_of_the_equality_is_as_before(jobs: Any, shared: Path):
-    """The cases name their commands; the files that they query are there."""
+def import_equality() -> Any:
+    """Return benchmarks/equality.py as a module."""
     sys.path.insert(0, str(SCRIPT.parent))
     try:
-        equality = importlib.import_module("equality")
+        return importlib.import_module("equality")
     finally:
         sys.path.remove(str(SCRIPT.parent))
+
+
+def test_a_part_of_the_equality_is_as_before(jobs: Any, shared: Path):
+    """The cases name their commands; the files that they query are there."""
+    equality = import_equality()
     cases = equality.cases(shared / "data", quick=False)
     names = ["demo", "zed", "kitchen", "street", "uncalibrated", "out of map", "atlas"]
     assert [case.name for case in cases] == names
-    images = [word for case in cases for word in case.query if isinstance(word, Path)]
-    assert len(images) >= 30 + 60
+    with_last_step = equality.cases(shared / "data", quick=False, has_last_step=True)
+    assert len(with_last_step) == len({case.name for case in with_last_step}) == 19
+    images = [word for case in with_last_step for word in case.query if isinstance(word, Path)]
+    assert len(images) >= 30 + 60 + 24 + 12
     assert all(path.exists() for path in images)
+
+
+def test_answers_of_an_old_commit_are_kept_by_case(jobs: Any, tmp_path: Path):
+    equality = import_equality()
+    first, second = equality.cases(tmp_path / "missing", quick=False, has_last_step=True)[:2]
+    kept = equality.Kept(tmp_path, "0123456789abcdef", [first, second], tmp_path)
+    kept.write({second.name: [{"query": "a", "localized": False}]})
+    assert kept.read() == {second.name: [{"query": "a", "localized": False}]}
+    alone = equality.Kept(tmp_path, "0123456789abcdef", [second], tmp_path)
+    assert alone.read() == {}, "its maps are made by other commands"

@@ -1,5 +1,5 @@
-"""Bounds of settings: what they let through, what they say, and that every setting of topoloc has a
-meaning and bounds."""
+"""Test the bounds of settings: accepted values, error messages, and that each setting has a
+description and bounds."""
 
 from __future__ import annotations
 
@@ -100,8 +100,8 @@ def test_no_number_that_is_not_one_passes(bound: Any, number: float):
 
 
 def _settings_of(kind: type, key: str) -> list[tuple[str, type, str, Any, Any]]:
-    """Key, class, name, annotation and default of every field, those of nested configurations
-    too."""
+    """Return key, class, name, annotation and default of each field, nested
+    configurations included."""
     config = kind()
     found: list[tuple[str, type, str, Any, Any]] = []
     for name, declared in field_annotations(kind).items():

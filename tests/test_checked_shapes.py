@@ -1,5 +1,5 @@
-"""The tests' own check of shapes refuses what the annotations forbid: sizes that do not agree, in
-functions and dataclasses."""
+"""Check that the tests' shape checks refuse sizes that contradict the annotations, in functions
+and dataclasses."""
 
 from __future__ import annotations
 

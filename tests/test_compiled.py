@@ -1,5 +1,5 @@
-"""Machine code is read from where it lies and kept where it can be; without a place for it
-functions run all the same."""
+"""Test the cache of machine code: read from its folder, stored if possible, and functions
+work without it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _CALL = (
 
 @pytest.fixture
 def module(tmp_path: Path) -> Path:
-    """The folder of a module of two kernels."""
+    """Return the folder of a module with two kernels."""
     (tmp_path / "code").mkdir()
     (tmp_path / "code" / "own_kernels.py").write_text(_MODULE)
     return tmp_path / "code"
@@ -126,8 +126,7 @@ def test_a_changed_kernel_beside_it_makes_it_another(module: Path):
 
 
 def test_no_kernel_uses_numbas_own_threads():
-    """Which several threads of Python must not use at once: Numba ends the process where they
-    do."""
+    """If several Python threads use Numba's threads at once, Numba ends the process."""
     import topoloc.localization.localizer  # noqa: F401
 
     with pytest.raises(ValueError, match="parallel"):
@@ -161,8 +160,8 @@ def test_a_number_of_threads_is_taken_and_changes_no_feature():
 
 
 def test_kernels_need_no_scipy():
-    """Numba compiles products of matrices and numpy.linalg with SciPy, which an installation of
-    topoloc does not have."""
+    """Numba compiles matrix products and numpy.linalg with SciPy, which topoloc
+    does not install."""
     import topoloc.slam.bundle.bundle_kernels  # noqa: F401 # declares kernels
 
     assert len(KERNELS) > 10

@@ -1,4 +1,4 @@
-"""Entries of a list that lie on disk come back as they were."""
+"""Test a list with entries on disk: they are read back unchanged."""
 
 from __future__ import annotations
 

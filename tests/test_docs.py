@@ -1,5 +1,5 @@
-"""Documentation that cannot rot: commands, settings, result keys, tables and public names are
-written down, and nothing else is."""
+"""Check the documentation against the code: commands, settings, result keys, tables and public
+names, no more and no less."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ UNREADABLE = NotLocalized("unreadable", detail="which file, and why")
 
 
 def _section(page: str, title: str) -> str:
-    """The section of a page below a heading of the second level."""
+    """Return the section of a page below a heading of the second level."""
     match = re.search(rf"^## {title}$(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
     assert match, f"no section '## {title}'"
     return match.group(1)
 
 
 def _settings(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
-    """The settings that `topoloc COMMAND --help` lists."""
+    """Return the settings that `topoloc COMMAND --help` lists."""
     with pytest.raises(SystemExit):
         main([command, "--help"])
     return set(re.findall(r"^\W*(--[a-z][\w.-]*)", capsys.readouterr().out, re.MULTILINE))
@@ -155,7 +155,7 @@ def test_python_examples_compile_and_use_public_names():
 
 
 def test_every_path_that_the_plan_names_exists():
-    """Paths in the plan are relative to the package, or else to the repository."""
+    """Resolve paths in the plan against the package, or else against the repository."""
     named = re.findall(r"`([\w./-]+(?:/[\w.-]*|\.(?:py|md|toml)))`", PLAN)
     assert len(named) > 40
     places = (ROOT / "src" / "topoloc", ROOT)
@@ -190,7 +190,7 @@ def test_every_name_in_the_plan_is_defined_in_the_file_beside_it():
 
 
 def _is_importable(name: str) -> bool:
-    """Whether a dotted name is a module, or an attribute of one."""
+    """Return whether a dotted name is a module, or an attribute of one."""
     module, _, attribute = name.rpartition(".")
     try:
         importlib.import_module(name)
@@ -215,7 +215,7 @@ def test_links_lead_somewhere(page: Path):
 
 
 def _read_variables() -> set[str]:
-    """The environment variables that the four distributions read, set or name."""
+    """Return the environment variables that the four distributions read, set or name."""
     named = (
         r"[\"'$](TOPOLOC_[A-Z_]+|NUMBA_[A-Z_]+|RAY_AUTH_[A-Z_]+|DRJIT_[A-Z_]+|[A-Z_]*NUM_THREADS)"
     )

@@ -1,4 +1,4 @@
-"""The examples run as their first lines say, and what they print is right."""
+"""Run the examples as their first lines show, and check their output."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ def _run_in(folder: Path, patch: pytest.MonkeyPatch, name: str, *args: object) -
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs an example in an empty folder as the command line does; returns what it printed."""
+    """Return a function that runs an example in an empty folder, as a shell does, and
+    returns its output."""
 
     def run_example(name: str, *args: object) -> str:
         _run_in(tmp_path, monkeypatch, name, *args)
@@ -51,7 +52,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
 
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A map of the built-in lab and what the first example of all, which made it, printed."""
+    """Return a map of the shipped lab, and the output of the example that built it."""
     folder, printed = tmp_path_factory.mktemp("example"), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         _run_in(folder, patch, "map_and_localize", "--ask", SHIPPED / "day@0::8")
@@ -109,7 +110,7 @@ def test_localize_folder(run: Run, lab: Path, tmp_path: Path):
 
 
 def test_own_camera(run: Run, lab: Path, monkeypatch: pytest.MonkeyPatch):
-    """The map that it makes is that of the first example."""
+    """The example makes the same map as the first one."""
     recordings: list[StereoSequence] = []
     monkeypatch.setattr(
         topoloc,
@@ -162,7 +163,7 @@ def test_inspect_map(run: Run, lab: Path, tmp_path: Path):
 
 
 def test_own_features(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A map of ORB opens where ORB is registered, and is refused with the remedy elsewhere."""
+    """A map of ORB opens if ORB is registered. Otherwise the error names the remedy."""
     monkeypatch.setattr(feature_types, "FEATURE_TYPES", dict(feature_types.FEATURE_TYPES))
     printed = run("own_features")
     assert "8 of 8 localized" in printed
@@ -202,7 +203,7 @@ def _refuses_in_a_new_process(path: Path, fault: str, remedy: str) -> None:
 
 
 def test_first_map_notebook(tmp_path: Path):
-    """Its code cells run in their order; the last line of each is shown, as a notebook does."""
+    """The code cells run in order. As in a notebook, the last line of each is shown."""
     path = EXAMPLES / "first_map.ipynb"
     notebook = json.loads(path.read_text(encoding="utf-8"))
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]

@@ -1,5 +1,5 @@
-"""Damaged inputs of every kind are read, or refused in one line: no crash, no traceback, no hang,
-no memory without end. The harness finds each of these."""
+"""Check that damaged inputs of each kind are read, or refused in one line, without crash, hang or
+huge memory. The harness finds each of these faults."""
 
 from __future__ import annotations
 

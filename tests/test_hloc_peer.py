@@ -1,4 +1,4 @@
-"""The benchmark beside hloc's scheme: which images it matches, and what it counts as wrong."""
+"""Test the benchmark with hloc's scheme: the matched images, and the threshold of a wrong pose."""
 
 from __future__ import annotations
 

@@ -15,9 +15,6 @@ from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src" / "topoloc"
 TESTS = ROOT / "tests"
-# Beyond these a missing idea is likely: a warning. Beyond the hard limit the test fails.
-MAX_FILE_LINES, MAX_FUNCTION_LINES = 300, 60
-HARD_LIMIT = 1.7
 
 PACKAGES = {
     SRC: TESTS,
@@ -31,29 +28,11 @@ MODULES = sorted(
 TEST_FILES = sorted(TESTS.rglob("*.py"))
 
 
-# The figures of `python tools/house.py .` (`--help` has the rule of each). A ceiling only goes
-# down, unless an issue grants an allowance. The goals stand behind the ceilings.
-CEILINGS = {
-    "lines.core": 42224,  # goal 30000; with images aside, other light, other floors, coarse depth
-    "lines.apps": 19965,  # goal 15500; with robots, phones, clients, floors of a map as they are
-    "statements.core": 21285,  # goal 13500; with images aside, other light, other floors, depth
-    "statements.apps": 11029,  # goal 7500; with robots, phones, clients, maps of a folder apart
-    "files_over_300": 0,  # goal 20
-    "functions_over_45": 4,  # goal 15
-    "folders_over_20": 0,  # goal 0
-    "one_importer": 76,  # goal 50
-    "apps.deep_names": 0,  # goal 0
-    "apps.public_names": 142,  # goal: at most 120; GrowingMap and move_map are new
-    "asserts.sum": 3,  # goal 40
-    "branches.map_or_atlas": 0,
-    "branches.walls": 0,  # goal 0
-    "constants.all": 436,  # goal 474, localization 25
-    "constants.core/localization": 24,
-    "user_docs_bytes": 150000,  # goal 150000; robots, phones, growing maps
-    "readme_lines": 149,  # goal 150
-    "architecture_lines": 110,  # goal 110
-}
-FLOORS = {"documented %": 90, "typed %": 95}
+# The figures of `python tools/house.py .` (`--help` has the rule of each) that have a rule. Sizes
+# have budgets instead (tools/budgets.py): one line more turns no test red.
+AT_MOST = {"circles": 0, "apps.deep_names": 0, "readme_lines": 150, "architecture_lines": 170}
+AT_LEAST = {"documented %": 90, "typed %": 95}
+MAX_FILE_LINES, MAX_FUNCTION_LINES = 400, 60  # of a function without its docstring
 # Modules of topoloc, and how many of OpenCV, Numba, torch, FAISS and ONNX Runtime, that are loaded
 # in a fresh process after an import.
 REACH = {
@@ -87,14 +66,14 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("name", CEILINGS)
-def test_figures_stay_below_their_ceilings(figures: dict[str, float], name: str):
-    assert figures[name] <= CEILINGS[name]
+@pytest.mark.parametrize("name", AT_MOST)
+def test_figures_are_at_most(figures: dict[str, float], name: str):
+    assert figures[name] <= AT_MOST[name]
 
 
-@pytest.mark.parametrize("name", FLOORS)
-def test_figures_stay_above_their_floors(figures: dict[str, float], name: str):
-    assert figures[name] >= FLOORS[name]
+@pytest.mark.parametrize("name", AT_LEAST)
+def test_figures_are_at_least(figures: dict[str, float], name: str):
+    assert figures[name] >= AT_LEAST[name]
 
 
 @pytest.mark.parametrize("name", REACH)
@@ -117,23 +96,17 @@ def test_imports_go_down_only(capsys: pytest.CaptureFixture[str]):
 
 
 def test_files_and_functions_stay_small():
-    sizes: list[tuple[float, str]] = []
+    long: list[str] = []
     for path in (*MODULES, *TEST_FILES):
         num_lines = len(path.read_text(encoding="utf-8").splitlines())
-        sizes.append((num_lines / MAX_FILE_LINES, f"{_relative(path)}: {num_lines} lines"))
+        long += [f"{_relative(path)}: {num_lines} lines"] * (num_lines > MAX_FILE_LINES)
         for node in ast.walk(_tree(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                assert node.end_lineno is not None
-                num_lines = node.end_lineno - node.lineno + 1
-                sizes.append(
-                    (
-                        num_lines / MAX_FUNCTION_LINES,
-                        f"{_relative(path)}: {node.name} has {num_lines} lines",
-                    )
-                )
-    if long := [text for share, text in sizes if share > 1]:
-        warnings.warn("a missing idea? " + "; ".join(long), stacklevel=1)
-    assert [text for share, text in sizes if share > HARD_LIMIT] == []
+                body = node.body[ast.get_docstring(node) is not None :] or node.body
+                num_lines = (body[-1].end_lineno or 0) - body[0].lineno + 1
+                row = f"{_relative(path)}: {node.name} has {num_lines} lines"
+                long += [row] * (num_lines > MAX_FUNCTION_LINES)
+    assert long == []
 
 
 def test_every_module_says_what_it_is():

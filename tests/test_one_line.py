@@ -1,5 +1,5 @@
-"""What an interactive session shows: one line of every public object, and a few of a result in a
-notebook. Type checkers tell the two results apart."""
+"""Test the display in an interactive session: one line per public object, and some lines per result
+in a notebook. Type checkers distinguish the two results."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_a_result_in_a_notebook_is_short():
 
 
 def test_a_type_checker_tells_results_and_frames_apart(tmp_path: Path):
-    """`localized` is a literal of each class; pyright narrows by `is True`, not by the truth."""
+    """`localized` is a literal of each class. pyright narrows by `is True`, not by truthiness."""
     (tmp_path / "a.py").write_text(PROGRAM)
     (tmp_path / "pyrightconfig.json").write_text("{}")
     command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "a.py"]
@@ -125,7 +125,8 @@ def test_a_type_checker_tells_results_and_frames_apart(tmp_path: Path):
 
 
 def test_no_other_public_dataclass_prints_what_it_holds():
-    """A new one inherits `OneLine`, has its own line, or holds a few numbers and joins these."""
+    """A new dataclass inherits `OneLine`, has its own line, or holds a few numbers and
+    joins this list."""
     small = "AtlasConfig GeoPoint GeoPositionPrior Illumination PoseConventions SingleMap"
     generated = {
         name

@@ -1,5 +1,5 @@
-"""What a stranger installs: the wheel is whole, the command answers, and nothing heavy is loaded
-before it is needed."""
+"""Test an installation: the wheel is complete, the command runs, and heavy modules are imported
+only when needed."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _run(*command: str | Path, **environment: str) -> subprocess.CompletedProces
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, made from the source distribution as an index would serve it."""
+    """Return the wheel, built from the source distribution as an index would serve it."""
     folder = tmp_path_factory.mktemp("dist")
     built = _run(
         sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, **os.environ
@@ -95,8 +95,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of programs of a virtual environment with the wheel and nothing else, not even its
-    dependencies."""
+    """Return the program folder of a virtual environment with only the wheel, without
+    its dependencies."""
     folder = tmp_path_factory.mktemp("venv")
     venv.create(folder, with_pip=False, symlinks=os.name != "nt")
     programs = folder / ("Scripts" if os.name == "nt" else "bin")

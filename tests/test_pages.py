@@ -1,5 +1,5 @@
-"""The pages of docs/: scripts, settings and names that they mention are there; the quickstart runs;
-Sphinx has nothing to warn of."""
+"""Test the pages of docs/: scripts, settings and names on them exist, the quickstart runs, and
+Sphinx has no warning."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def _read(name: str) -> str:
 
 
 def _run(*command: str | Path, folder: Path) -> str:
-    """The output of a program that must end with status 0, run with this Python's programs first in
-    PATH."""
+    """Run a program with this Python's folder first in PATH, and return its output. It
+    must exit with 0."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
     done = subprocess.run(
         list(map(str, command)),
@@ -48,7 +48,7 @@ def _run(*command: str | Path, folder: Path) -> str:
 
 
 def _marked_blocks(page: str, language: str) -> list[str]:
-    """The code blocks of a page that it says are run here."""
+    """Return the code blocks that a page marks as run by this test."""
     mark = re.escape("<!-- run by tests/test_pages.py -->")
     return re.findall(rf"^{mark}\n```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
 
@@ -103,7 +103,7 @@ def test_a_public_name_has_one_door():
 
 
 def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixture[str]):
-    """The table of the paper's own settings."""
+    """Check the table of the paper's own settings."""
     from topoloc.apps.cli import main
 
     helps = ""
@@ -119,8 +119,8 @@ def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_settings_of_files_that_a_page_names_are_there(page: Path, tmp_path: Path):
-    """Lines as `localize.num_candidates = 1`, keys as `train.vlad_nn.tuning.num_epochs`, and blocks
-    of TOML."""
+    """Check lines such as `localize.num_candidates = 1`, keys such as
+    `train.vlad_nn.tuning.num_epochs`, and TOML blocks."""
     text, tables = page.read_text(encoding="utf-8"), "|".join(all_tables())
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     blocks += re.findall(rf"`((?:{tables})\.[\w.]+ = [^`]+)`", text)

@@ -1,5 +1,5 @@
-"""`Rigid3.is_same` alone decides if two poses are the same, and `geometry/transform_consensus.py`
-alone searches for the transform that most estimates agree on. Search the source for others."""
+"""Search the source for duplicates: only `Rigid3.is_same` may decide if two poses are equal, and
+only `geometry/transform_consensus.py` may search for the consensus of transforms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The public names do the work of the commands, from paths."""
+"""Check that the public names do the work of the commands, given paths."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _docstrings() -> Iterator[tuple[str, str]]:
 
 
 def test_errors_that_public_names_raise_are_of_the_documented_tree():
-    """Or Python's own. The tree is on the page of the public names."""
+    """Python's own errors are allowed, too. The page of the public names shows the tree."""
     raised = {
         error: name
         for name, text in _docstrings()

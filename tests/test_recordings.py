@@ -1,5 +1,5 @@
-"""The whole on real recordings: what must not be lost. The full figures come from
-benchmarks/real_recordings.py."""
+"""Test the whole pipeline on real recordings. benchmarks/real_recordings.py prints
+the full figures."""
 
 from __future__ import annotations
 

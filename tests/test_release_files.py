@@ -1,5 +1,5 @@
-"""The files that a code host and an index read: workflows call what exists, forms have their parts,
-and the links of the distributions lead to the repository."""
+"""Test the files for a code host and an index: workflows call existing targets, forms are complete,
+and links lead to the repository."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _release(*args: str | Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def released(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The four distributions, built for an index."""
+    """Return the four distributions, built for an index."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("a release is made from a checkout of git")
     folder = tmp_path_factory.mktemp("released")
@@ -93,7 +93,7 @@ def released(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _metadata(folder: Path, name: str) -> list[Message]:
-    """The metadata of a wheel and of a source distribution, as an index reads them."""
+    """Return the metadata of a wheel and of a source distribution, as an index reads them."""
     (wheel,), (source,) = folder.glob(f"{name}-*.whl"), folder.glob(f"{name}-*.tar.gz")
     with zipfile.ZipFile(wheel) as archive:
         (path,) = [one for one in archive.namelist() if one.endswith(".dist-info/METADATA")]

@@ -1,4 +1,4 @@
-"""Files of earlier versions contain settings that no longer exist."""
+"""Test files of earlier versions with settings that no longer exist."""
 
 from __future__ import annotations
 

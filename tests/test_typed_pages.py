@@ -1,5 +1,5 @@
-"""The commands of README.md and the quickstart, typed in their order, in one folder, with the
-libraries that `make demo` installs. The Python of README runs, too."""
+"""Run the commands of README.md and the quickstart in order, in one folder, with the libraries that
+`make demo` installs. The Python code of README runs, too."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def _is_typed(command: str) -> bool:
 
 
 def _resampled(image: np.ndarray, size: tuple[int, int], f: float, c: tuple[float, float]):
-    """Return an image of the demo's camera (f 380 px, centre 319.5, 199.5) as another camera of
-    the same position sees it."""
+    """Return an image of the demo's camera (f 380 px, centre 319.5, 199.5) as another camera at the
+    same position sees it."""
     old = np.array([[380.0, 0, 319.5], [0, 380.0, 199.5], [0, 0, 1]])
     new = np.array([[f, 0, c[0]], [0, f, c[1]], [0, 0, 1]])
     return cv2.warpPerspective(image, new @ np.linalg.inv(old), size, flags=cv2.INTER_AREA)
@@ -86,7 +86,8 @@ def _resampled(image: np.ndarray, size: tuple[int, int], f: float, c: tuple[floa
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what a reader has: office/, walk/ and photo.jpg, all from the demo's lab."""
+    """Return a folder with the files of a reader: office/, walk/ and photo.jpg, all from
+    the demo's lab."""
     folder = tmp_path_factory.mktemp("place")
     (folder / "site").mkdir()
     (folder / "site" / "sitecustomize.py").write_text(_BAR, encoding="utf-8")
@@ -140,8 +141,7 @@ def _environment(place: Path) -> dict[str, str]:
 
 
 def _type(script: str, place: Path, *program: str) -> str:
-    """Return what a program printed on standard output. It must end with status 0 and print no
-    error."""
+    """Return the standard output of a program. It must exit with 0 and print no error."""
     done = subprocess.run(
         [*program, script],
         cwd=place,
@@ -156,7 +156,7 @@ def _type(script: str, place: Path, *program: str) -> str:
 
 
 def _type_in_shell(commands: list[str], place: Path) -> str:
-    """Type commands in one shell, so that a variable of one line is known to the next."""
+    """Type commands in one shell, so that later lines can use its variables."""
     words = re.compile(rf"\b({'|'.join(PLACEHOLDERS)})\b")
     lines = [words.sub(lambda word: PLACEHOLDERS[word[0]], command) for command in commands]
     return _type("\n".join(lines), place, "bash", "-euo", "pipefail", "-c")
@@ -212,7 +212,7 @@ def test_python_of_readme_runs(place: Path):
 
 @pytest.mark.slow
 def test_all_commands_work_in_their_order(place: Path):
-    """`make demo` first, as the pages say. A service ends with Ctrl-C."""
+    """`make demo` runs first, as on the pages. A service ends with Ctrl-C."""
     shutil.rmtree(place / "topoloc-demo", ignore_errors=True)
     (place / "office.topo").unlink(missing_ok=True)
     block = list[str]()

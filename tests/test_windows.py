@@ -1,5 +1,5 @@
-"""Files as Windows treats them, simulated: no `flock`, no folder that can be opened, and no file
-that is renamed, replaced or removed while this process has it open."""
+"""Simulate files on Windows: no `flock`, no opening of folders, and no rename, replacement or
+removal of a file that this process has open."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _is_ours(path: Any) -> bool:
 
 
 def _refuse_if_open(path: Any) -> None:
-    """Raise what Windows raises for a file that is open or mapped into memory."""
+    """Raise the error of Windows for a file that is open or mapped into memory."""
     wanted = _status_of(path)
     opened = [_status_of(f"/proc/self/fd/{name}") for name in os.listdir(_DESCRIPTORS)]
     mapped = f" {os.path.realpath(path)}\n" in Path("/proc/self/maps").read_text("utf-8")
@@ -54,7 +54,7 @@ def _refuse_if_open(path: Any) -> None:
 
 @pytest.fixture
 def windows() -> Iterator[None]:
-    """Replaces the functions of the system that differ."""
+    """Replace the functions of the system that differ."""
     system = {name: getattr(os, name) for name in ("open", "fsync")}
 
     def open_file(path: Any, flags: int, mode: int = 0o777, **more: Any) -> int:
@@ -150,7 +150,7 @@ def test_a_file_that_stays_open_is_one_line_with_the_remedy(
 
 @pytest.fixture
 def edited(windows: None, room_map: Path, tmp_path: Path) -> Iterator[tuple[Path, TopoMetricMap]]:
-    """A copy of a map, and the same opened by a reader who keeps it open."""
+    """Return a copy of a map, and the same map held open by a reader."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     with TopoMetricMap.load(path) as topomap:
         yield path, topomap
@@ -247,7 +247,7 @@ def test_the_service_starts_and_stops_without_handlers_of_the_loop(room_map: Pat
 
 
 def _calls_without_encoding(tree: ast.AST) -> Iterator[int]:
-    """Yield the lines of methods and functions that open a file as text, in any encoding."""
+    """Yield the lines of calls that open a text file without an encoding."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and "encoding" not in {one.arg for one in node.keywords}:
             owner, _, name = ast.unparse(node.func).rpartition(".")

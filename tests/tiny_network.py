@@ -1,4 +1,4 @@
-"""The smallest file that is a network of local features by our contract."""
+"""Write the smallest network file of local features that follows topoloc's contract."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STRIDE = 8
 
 
 def cells(descriptor_size: int = 64) -> np.ndarray:
-    """The weights of its descriptors: each is as many sums over the pixels of a cell."""
+    """Return the descriptor weights: each element is one weighted sum over the pixels of a cell."""
     return (
         np.random.default_rng(0)
         .normal(size=(descriptor_size, 1, STRIDE, STRIDE))
@@ -27,8 +27,8 @@ def write_network(
     outputs: tuple[str, ...] = ("scores", "descriptors"),
     descriptor_size: int = 64,
 ) -> Path:
-    """The smallest network of the contract: the picture as its scores, sums over each cell as a
-    descriptor, and, where there is a third output, means of eight pixels by eight."""
+    """Write a network with the image as scores and sums over each cell as descriptors. A third
+    output, if named, has means of eight by eight pixels."""
     nodes = [
         helper.make_node("Identity", ["image"], [outputs[0]]),
         helper.make_node(

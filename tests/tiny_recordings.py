@@ -1,4 +1,4 @@
-"""What the tiny recordings of the tests are made of: pictures, poses, and their written forms."""
+"""Make images and poses of the tiny recordings, and their text forms."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 32, 24
 
 
 def picture(seed: int, channels: int = 1, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """A picture of its own for each seed: grey, or OpenCV's BGR."""
+    """Return a different image for each seed: grey, or OpenCV's BGR."""
     shape = (height, width) if channels == 1 else (height, width, channels)
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
@@ -58,7 +58,7 @@ def assert_same_frame(one: StereoFrame, other: StereoFrame) -> None:
 
 
 def assert_slices(sequence: StereoSequence) -> None:
-    """A slice is a recording of the same frames and poses, and every index is one of Python's."""
+    """Check that a slice has the same frames and poses, and that all Python indices work."""
     num_frames = len(sequence)
     assert re.fullmatch(r"\w+\(.*, [0-9]+ frames( of stereo| with depth)?\)", repr(sequence))
     assert len(repr(sequence[:][:][:])) < 200

@@ -1,8 +1,8 @@
-"""A small textured room, rendered exactly: stereo pairs and depth pictures along a path, so that
-tests need no real recording.
+"""Render a small textured room exactly: stereo pairs and depth images along a path, so that tests
+need no real recording.
 
-The world has z up. Pictures are ray-cast plane by plane; the textures are smooth enough not to
-alias at the distances used.
+The world has z up. Images are ray-cast plane by plane. The textures are smooth enough to avoid
+aliasing at the distances used.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _TEXELS_PER_METRE = 90.0
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A textured rectangle: its centre, its two unit axes (to the texture's right and down), half
-    its sides, metres."""
+    """Hold a textured rectangle: its centre, two unit axes (the texture's right and down), and half
+    sides in metres."""
 
     centre: np.ndarray
     right: np.ndarray
@@ -41,8 +41,8 @@ class Panel:
 
 
 def room(seed: int = 0) -> list[Panel]:
-    """A back wall, a side wall, a floor, and two boards standing in front; another seed is another
-    place."""
+    """Return a back wall, a side wall, a floor, and two boards in front. Another seed is
+    another place."""
     up_down = np.array([0.0, 0.0, -1.0])
     shapes = [
         (np.array([0.8, 4.0, 0.0]), np.array([1.0, 0.0, 0.0]), up_down, (3.5, 2.0)),
@@ -69,7 +69,7 @@ def room(seed: int = 0) -> list[Panel]:
 
 
 def smooth_texture(seed: int, half: tuple[float, float]) -> np.ndarray:
-    """Noise of several sizes, float32 in [20, 235]; no two places of it look alike."""
+    """Return noise of several sizes, float32 in [20, 235], without repetition."""
     rng = np.random.default_rng(seed)
     width, height = (round(2 * side * _TEXELS_PER_METRE) for side in half)
     total = np.zeros((height, width), np.float32)
@@ -81,8 +81,8 @@ def smooth_texture(seed: int, half: tuple[float, float]) -> np.ndarray:
 
 
 def path_pose(index: float) -> Rigid3:
-    """world_from_cam of the left camera along the path: 0.13 m a step to the side, swaying a
-    little."""
+    """Return world_from_cam of the left camera along the path: 0.13 m per step to the side,
+    with a small sway."""
     yaw, pitch = 0.06 * np.sin(0.5 * index), 0.03 * np.cos(0.7 * index)
     sway = exp_so3(np.array([0.0, 0.0, yaw])) @ exp_so3(np.array([pitch, 0.0, 0.0]))
     return Rigid3(
@@ -92,8 +92,8 @@ def path_pose(index: float) -> Rigid3:
 
 @cache
 def _rays(camera: Camera) -> np.ndarray:
-    """The directions of the pixels in the camera's frame, row by row of the picture: 3 x N, the
-    third is 1."""
+    """Return the directions of the pixels in the camera frame, row by row: 3 x N,
+    the third is 1."""
     columns, rows = np.meshgrid(
         np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
     )
@@ -104,8 +104,8 @@ def _rays(camera: Camera) -> np.ndarray:
 def render(
     panels: list[Panel], world_from_cam: Rigid3, camera: Camera = CAMERA, noise_seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The grey picture (uint8, with a grey level of noise) and its exact depth (float64, metres,
-    NaN where nothing is)."""
+    """Return the grey image (uint8, with one grey level of noise) and its exact depth (float64,
+    metres, NaN without a surface)."""
     rays = _rays(camera)
     depth = np.full(rays.shape[1], np.inf)
     grey = np.full(rays.shape[1], 127.5, np.float32)
@@ -139,7 +139,7 @@ def render(
 
 
 def right_pose(world_from_left: Rigid3) -> Rigid3:
-    """world_from_right of the rectified rig."""
+    """Return world_from_right of the rectified rig."""
     return world_from_left @ Rigid3(np.eye(3), np.array([BASELINE, 0.0, 0.0]))
 
 
@@ -156,8 +156,8 @@ def write_stereo_recording(
     indices: list[float] | None = None,
     panels: list[Panel] | None = None,
 ) -> Path:
-    """A KITTI-like recording with truth.tum, and the camera.json that a query by its pictures
-    needs; returns `folder`."""
+    """Write a KITTI-like recording with truth.tum and a camera.json for queries, and
+    return `folder`."""
     indices = indices if indices is not None else [float(index) for index in range(NUM_FRAMES)]
     panels = panels or room(seed)
     for side in ("image_0", "image_1"):
@@ -179,8 +179,8 @@ def write_stereo_recording(
 
 
 def write_depth_recording(folder: Path, seed: int = 0, indices: list[float] | None = None) -> Path:
-    """The same path as a folder of pictures with registered depth, camera.json and truth.tum;
-    returns `folder`."""
+    """Write the same path as images with registered depth, camera.json and truth.tum, and
+    return `folder`."""
     indices = indices if indices is not None else [float(index) for index in range(NUM_FRAMES)]
     panels = room(seed)
     for side in ("rgb", "depth"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from . import atlases, edits, long_jobs, motion, old_files, pages, places, serving, sizes
+from . import atlases, budgets, edits, long_jobs, motion, old_files, pages, places, serving, sizes
 from .figures import Figure
 from .workplace import Workplace
 
@@ -34,6 +34,8 @@ JOBS = {
     "serve": Job(serving.serve),
     "pages": Job(pages.pages, quick=True),
     "size": Job(sizes.size, quick=True, alone=True),
+    "structure": Job(budgets.structure),
+    "costs": Job(budgets.costs, alone=True),
     "equality": Job(places.equality, quick=True),
     "train": Job(long_jobs.train),
     "paper": Job(long_jobs.paper),

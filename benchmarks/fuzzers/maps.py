@@ -13,8 +13,9 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.contradictions import find_contradictions
-from topoloc.mapping.edit import edit_map, find_kept_files, read_history, undo_edit
+from topoloc.mapping.edit import edit_map, read_history, undo_edit
 from topoloc.mapping.storage.integrity_check import find_map_damage
+from topoloc.mapping.storage.kept_files import find_kept_files
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.image_io import read_image
 

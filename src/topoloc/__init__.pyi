@@ -40,7 +40,7 @@ from topoloc.errors import (
     WeightsError as WeightsError,
 )
 from topoloc.evaluation.certification import Certification as Certification, certify as certify
-from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery
+from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery, WorldFit as WorldFit
 from topoloc.evaluation.query_localization import (
     Evaluation as Evaluation,
     evaluate as evaluate,
@@ -48,8 +48,7 @@ from topoloc.evaluation.query_localization import (
     localize_out_of_map as localize_out_of_map,
     localize_queries as localize_queries,
 )
-from topoloc.evaluation.world_alignment import WorldFit as WorldFit
-from topoloc.geometry.camera import Camera as Camera
+from topoloc.geometry.camera import Camera as Camera, UncalibratedCamera as UncalibratedCamera
 from topoloc.geometry.geodesy import (
     GeoPoint as GeoPoint,
     GeoPose as GeoPose,
@@ -58,7 +57,6 @@ from topoloc.geometry.geodesy import (
 from topoloc.geometry.pose_conventions import PoseConventions as PoseConventions
 from topoloc.geometry.rig import StereoRig as StereoRig
 from topoloc.geometry.rigid import Rigid3 as Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera as UncalibratedCamera
 from topoloc.lifelong.growing import GrowingMap as GrowingMap, Growth as Growth
 from topoloc.lifelong.merge import merge as merge
 from topoloc.lifelong.move import move_map as move_map
@@ -75,6 +73,7 @@ from topoloc.lifelong.weak_regions import (
     WeakRegions as WeakRegions,
     find_weak_regions as find_weak_regions,
 )
+from topoloc.localization.answer import Finding as Finding
 from topoloc.localization.image_calibration_check import (
     check_camera_calibrations as check_camera_calibrations,
 )
@@ -93,21 +92,24 @@ from topoloc.localization.result import (
 )
 from topoloc.localization.search import Trace as Trace, TriedProposal as TriedProposal
 from topoloc.mapping.build import BuildConfig as BuildConfig
-from topoloc.mapping.edit import read_history as read_history, undo_edit as undo_edit
+from topoloc.mapping.edit import (
+    read_history as read_history,
+    set_look_alike_floors as set_look_alike_floors,
+    undo_edit as undo_edit,
+)
 from topoloc.mapping.georeference import (
     GeoreferenceResult as GeoreferenceResult,
     georeference as georeference,
 )
-from topoloc.mapping.sessions import Illumination as Illumination
-from topoloc.mapping.storage.entries import TopoNode as TopoNode
+from topoloc.mapping.storage.entries import Illumination as Illumination, TopoNode as TopoNode
 from topoloc.mapping.topomap import TopoMetricMap as TopoMetricMap
 from topoloc.recordings.frame import (
     DepthImage as DepthImage,
     Image as Image,
+    MemorySequence as MemorySequence,
     StereoFrame as StereoFrame,
     StereoSequence as StereoSequence,
 )
-from topoloc.recordings.frame_checks import MemorySequence as MemorySequence
 from topoloc.recordings.image_io import read_depth as read_depth, read_image as read_image
 from topoloc.recordings.open import open_sequence as open_sequence
 from topoloc.recordings.trajectory import (

@@ -21,7 +21,7 @@ from topoloc.recordings.atomic import (
     write_folder as write_folder,
     write_text as write_text,
 )
-from topoloc.recordings.camera_json import (
+from topoloc.recordings.camera_files import (
     CameraCalibration as CameraCalibration,
     read_camera_json as read_camera_json,
 )

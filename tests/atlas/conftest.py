@@ -1,4 +1,4 @@
-"""Two small maps of different rooms, and an atlas of them that no test writes to."""
+"""Provide two small maps of different rooms, and a read-only atlas of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from topoloc.atlas.editing import create_atlas, new_tiles
 
 @pytest.fixture(scope="session")
 def atlas(room_map: Path, other_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An atlas of the tiles `room` and `other`."""
+    """Return an atlas of the tiles `room` and `other`."""
     where = tmp_path_factory.mktemp("atlas") / "campus"
     create_atlas(str(where), new_tiles([str(room_map), str(other_map)]))
     return where
@@ -21,5 +21,5 @@ def atlas(room_map: Path, other_map: Path, tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture
 def own_atlas(atlas: Path, tmp_path: Path) -> Path:
-    """A copy that may be written to."""
+    """Return a copy of the atlas that a test may change."""
     return Path(shutil.copytree(atlas, tmp_path / "campus"))

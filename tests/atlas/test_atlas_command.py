@@ -1,4 +1,4 @@
-"""`topoloc atlas`, and the commands that take an atlas where they take a map."""
+"""Test `topoloc atlas`, and the commands that accept an atlas in place of a map."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Complaint = Callable[..., str]
 
 @pytest.fixture(scope="module")
 def of_both(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two pictures of the one room, then one of the other."""
+    """Return two images of one room, then one of the other."""
     views = [*unseen_views()[:2], unseen_views(seed=1)[1]]
     return write_pictures(tmp_path_factory.mktemp("both") / "pictures", views)
 
@@ -133,8 +133,8 @@ def test_near_leaves_tiles_out_that_are_known_to_lie_elsewhere(
 
 
 def test_truth_is_that_of_one_tile(atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]):
-    """Of the third picture the truth is said to lie in the room, and the answer is in the other
-    one: a false accept."""
+    """The truth of the third image is wrongly given in the room, and its pose is in the other tile:
+    a false accept."""
     evaluation = json.loads(_json(capsys, "evaluate", atlas, of_both, "--tile", "room"))
     assert (
         evaluation["num_queries"],

@@ -1,5 +1,4 @@
-"""Tiles added and removed: nobody's are lost, files stay as long as somebody may read them, and no
-longer."""
+"""Check that tiles of parallel writers survive, and that files stay while readers may need them."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ NUM_WRITES = {"folder": 25, "memory": 12, "s3": 12}
 
 @pytest.fixture(params=list(NUM_WRITES))
 def somewhere(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """Where an atlas may be made: a folder, a store in memory, and S3."""
+    """Return the address of a new atlas: a folder, a store in memory, or S3."""
     if request.param == "folder":
         return str(tmp_path / "campus")
     if request.param == "s3":
@@ -149,7 +148,7 @@ def test_a_tile_that_comes_back_is_not_swept(room_map: Path, tmp_path: Path):
 def test_two_writers_at_once_lose_nothing(
     somewhere: str, room_map: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Writes of two writers that begin together; what is slow about a tile is left out."""
+    """Two writers begin together. The slow parts of a tile are replaced."""
     num_writes = NUM_WRITES[somewhere.partition("://")[0] if "://" in somewhere else "folder"]
     create_atlas(somewhere, new_tiles([str(room_map)]))
     ready = Atlas.open(somewhere).tile("room")
@@ -185,8 +184,8 @@ def test_two_writers_at_once_lose_nothing(
 def test_a_writer_that_comes_too_late_begins_anew(
     room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Another writer commits between reading and committing: its tile is there afterwards, and a
-    clash of ids with it is told."""
+    """Another writer commits between read and commit. Its tile stays, and a clash of
+    ids is an error."""
     where = str(tmp_path / "campus")
     create_atlas(where, [])
     made: Callable[[NewTile, Store], Tile] = editing.store_tile

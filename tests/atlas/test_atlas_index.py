@@ -1,5 +1,4 @@
-"""The index ranks tiles by their most similar place, also where these have vectors by different
-kinds of features."""
+"""Check that the index ranks tiles by their most similar place, also across feature types."""
 
 from __future__ import annotations
 

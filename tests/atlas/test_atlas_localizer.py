@@ -1,5 +1,5 @@
-"""An atlas answers as the tile that knows the place, names it, and does not choose between two that
-know it as well."""
+"""Check that an atlas returns the result of the right tile, names it, and reports similar
+tiles as ambiguous."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import query
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_query import MapQuery
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
-from topoloc.localization.schedule import TileQuery
 from topoloc.mapping.topomap import TopoMetricMap
 
 BUDGET = 100_000_000
@@ -108,10 +108,10 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
     atlas: Path, monkeypatch: pytest.MonkeyPatch, min_similarity: float, num_asked: int
 ):
     asked = list[str]()
-    exhaustive = TileQuery.exhaustive
+    exhaustive = MapQuery.search_all
     monkeypatch.setattr(
-        TileQuery,
-        "exhaustive",
+        MapQuery,
+        "search_all",
         lambda self: asked.append(self.opened.map_id) or exhaustive(self),
     )
     monkeypatch.setattr(Wide, "min_similarity", min_similarity)
@@ -122,7 +122,7 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
 
 
 def test_two_tiles_that_know_the_place_as_well_are_both_named(own_atlas: Path, room_map: Path):
-    """The same room in two buildings of one plan: nothing tells them apart."""
+    """Two buildings have the same room, and no image can distinguish them."""
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin"))
     result = _localizer(own_atlas).localize(unseen_views()[0][0], CAMERA)
     assert isinstance(result, NotLocalized)
@@ -136,12 +136,12 @@ def test_two_tiles_that_know_the_place_as_well_are_both_named(own_atlas: Path, r
 def test_a_look_alike_that_cannot_come_near_is_left_at_that(
     atlas: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Neither does it cost a glance, nor is it named."""
+    """A similar tile that cannot rival the pose is neither searched nor named."""
     asked = list[str]()
-    glance = TileQuery.coarse_only
+    glance = MapQuery.search_first
     monkeypatch.setattr(
-        TileQuery,
-        "coarse_only",
+        MapQuery,
+        "search_first",
         lambda self: asked.append(self.opened.first.map.kind.name) or glance(self),
     )
     monkeypatch.setattr(Wide, "max_rival_gap", 2.0)
@@ -159,7 +159,7 @@ def test_a_twin_that_is_asked_last_is_heard(own_atlas: Path, room_map: Path):
 
 
 def test_two_tiles_of_one_world_agree(own_atlas: Path, room_map: Path):
-    """The same two, where it is known that both are the same place."""
+    """The atlas states that both tiles show the same place."""
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "room", "house"), replaces=True)
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin", "house"))
     assert isinstance(_localizer(own_atlas).localize(unseen_views()[0][0], CAMERA), Localization)
@@ -212,7 +212,7 @@ def test_a_tile_that_cannot_be_read_leaves_the_rest(own_atlas: Path, harm: str):
 
 
 def test_where_the_likely_tile_is_gone_another_one_refuses(own_atlas: Path):
-    """By default a tile that leads by far would be asked alone."""
+    """By default, a tile with a clear lead would be searched alone."""
     (own_atlas / Atlas.open(str(own_atlas)).tile("room").map.name).unlink()
     said = list[str]()
     localizer = _localizer(own_atlas, None, said)

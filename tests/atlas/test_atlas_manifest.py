@@ -1,5 +1,5 @@
-"""What `atlas.json` says comes back as it was written, and is refused in one line where it was
-not."""
+"""Check that `atlas.json` is read as it was written, and that a damaged file is
+refused in one line."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def test_what_is_written_is_read():
 
 
 def test_georeferenced_tiles_lie_in_one_world():
-    """Two maps of one corner, georeferenced from different origins: the corner is one point of the
-    atlas."""
+    """Two maps share a corner and have different geographic origins. The corner is one
+    point of the atlas."""
     near, far = GeoPoint(50.0, 4.0, 30.0), GeoPoint(50.001, 4.001, 35.0)
     corner_ecef = GeoPoint(50.0005, 4.0002, 33.0).ecef()
     turns = [Rigid3(exp_so3(np.array([0.0, 0.0, angle])), np.zeros(3)) for angle in (0.4, 2.0)]

@@ -1,5 +1,5 @@
-"""`topoloc merge` of atlases: every tile as it was, worlds and joins their own, and nothing where
-two tiles are taken for one."""
+"""Test `topoloc merge` of atlases: tiles, worlds and joins stay as they were, and a conflict of two
+tiles changes nothing."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ import pytest
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins, create_atlas, new_tiles
-from topoloc.atlas.joins import Join
-from topoloc.atlas.place import merge_atlases
+from topoloc.atlas.joint_worlds import Join
 from topoloc.errors import AtlasError
 from topoloc.geometry.rigid import Rigid3
 
@@ -49,7 +48,7 @@ def test_joins_stay_and_worlds_of_one_name_are_two(room_map: Path, other_map: Pa
         tiles,
     )
     same_name = _atlas(tmp_path / "alone", room_map, tile_id="twin", world="room")
-    merged = merge_atlases([pair, same_name], str(tmp_path / "all"))
+    merged = Atlas.merge([pair, same_name], str(tmp_path / "all")).manifest
     assert [join.pair for join in merged.joins] == [("other", "room")]
     by_id = merged.by_id
     assert by_id["room"].from_world_of(by_id["other"]) is not None
@@ -62,7 +61,7 @@ def test_a_map_that_both_hold_is_one_tile_and_makes_their_worlds_one(
 ):
     one = _atlas(tmp_path / "one", room_map, other_map, world="campus")
     two = _atlas(tmp_path / "two", room_map, world="yard")
-    merged = merge_atlases([one, two, str(room_map)], str(tmp_path / "all"))
+    merged = Atlas.merge([one, two, str(room_map)], str(tmp_path / "all")).manifest
     assert {tile.tile_id: tile.world for tile in merged.tiles} == {
         "room": "campus",
         "other": "campus",
@@ -77,7 +76,7 @@ def test_two_maps_of_one_name_are_refused(
         _atlas(tmp_path / "two", other_map, tile_id="room"),
     )
     with pytest.raises(AtlasError, match="has a tile room too"):
-        merge_atlases([one, two], str(tmp_path / "all"))
+        Atlas.merge([one, two], str(tmp_path / "all"))
     assert "is an atlas already" in complaint("merge", one, str(other_map), two)
 
 
@@ -86,6 +85,6 @@ def test_a_rotten_tile_is_named_and_no_atlas_made(room_map: Path, other_map: Pat
     damaged = Atlas.open(two)
     damaged.map_path(damaged.tile("other")).write_bytes(b"rotten")
     with pytest.raises(AtlasError, match="checksum is another"):
-        merge_atlases([one, two], str(tmp_path / "all"))
+        Atlas.merge([one, two], str(tmp_path / "all"))
     with pytest.raises(AtlasError, match="is no atlas"):
         Atlas.open(str(tmp_path / "all"))

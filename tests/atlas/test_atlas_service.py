@@ -1,5 +1,5 @@
-"""An atlas behind the service: tiles are maps under their ids, and every map is asked through the
-atlas."""
+"""Test the service of an atlas: tiles are maps under their ids, and queries may address
+the whole atlas."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`topoloc update ATLAS`: recordings join the tiles that they are of, as they would join the tile's
-map file; nobody is overwritten."""
+"""Test `topoloc update ATLAS`: recordings update their tiles exactly as a map file, and parallel
+changes are kept."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from tiny_world import write_stereo_recording
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, add_tiles, create_atlas, new_tiles
-from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import Tile
-from topoloc.atlas.place import edit_tile
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.tiles.tile_joining import select_tile
@@ -33,7 +32,7 @@ Complaint = Callable[..., str]
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Recordings of both rooms of the atlas, and of a third one."""
+    """Return recordings of both rooms of the atlas, and of a third room."""
     folder = tmp_path_factory.mktemp("sessions")
     rows = {
         "evening": (0, np.arange(0.25, 5.5, 0.25)),
@@ -67,7 +66,7 @@ def _map(where: object, tile_id: str) -> bytes:
 
 
 def _note(path: Path, text: str) -> None:
-    """An edit that changes a map's history alone."""
+    """Edit only the history of a map."""
     with edit_map(path) as edit:
         edit.commit(edit.topomap, text)
 
@@ -111,7 +110,7 @@ def test_each_recording_joins_its_tile_as_it_would_join_the_map(
 def test_a_tile_that_is_named_is_not_sought(
     own_atlas: Path, sessions: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ):
-    """What is of another one does not fit it; the others go on."""
+    """A recording of another tile does not fit the named one. The other recordings continue."""
     before = _map(own_atlas, "room")
     updated = _updated(
         capsys, 1, own_atlas, sessions["evening"], sessions["night"], "--tile", "other"
@@ -161,7 +160,7 @@ def test_who_replaced_the_tile_meanwhile_is_not_overwritten(
         _note(path, f"try {len(num_nodes)}")
         return len(num_nodes)
 
-    tries = edit_tile(somewhere, "hall", edit)
+    tries = Atlas.open(somewhere).edit("hall", edit)
     tile = Atlas.open(somewhere).tile("hall")
     assert (tries, tile.num_nodes, tile.world, tile.recipe) == (2, num_nodes[1], "campus", None)
     assert num_nodes[0] != num_nodes[1]
@@ -180,7 +179,7 @@ def test_others_who_are_always_faster_are_left_alone(
         add_tiles(somewhere, new_tiles([str(theirs)], "hall"), replaces=True)
 
     with pytest.raises(AtlasError, match="was replaced by others 5 times"):
-        edit_tile(somewhere, "hall", edit)
+        Atlas.open(somewhere).edit("hall", edit)
     assert _notes(somewhere, "hall") == ["theirs"] * 5
     assert Atlas.open(somewhere).tile("hall").num_nodes > 0
 
@@ -193,8 +192,8 @@ def test_joins_world_and_recipe_stay_what_they_are(somewhere: str, room_map: Pat
     tiles = Atlas.open(somewhere).manifest.by_id
     pose = Rigid3(np.eye(3), np.array([3.0, 1.0, 0.0]))
     before = add_joins(somewhere, [Join("hall", "yard", pose, 1e-4 * np.eye(6), 20)], tiles)
-    edit_tile(somewhere, "yard", lambda path: _note(path, "one"))
-    edit_tile(somewhere, "hall", lambda path: _note(path, "two"))
+    Atlas.open(somewhere).edit("yard", lambda path: _note(path, "one"))
+    Atlas.open(somewhere).edit("hall", lambda path: _note(path, "two"))
     after = Atlas.open(somewhere).manifest
     tile = after.by_id["hall"]
     assert [join.to_json() for join in after.joins] == [join.to_json() for join in before.joins]
@@ -216,11 +215,11 @@ def test_nothing_is_left_and_nothing_changed_where_it_fails(
         raise TrajectoryError("it does not fit")
 
     with pytest.raises(TrajectoryError, match="does not fit"):
-        edit_tile(str(own_atlas), "room", fails)
+        Atlas.open(str(own_atlas)).edit("room", fails)
     file = own_atlas / Atlas.open(str(own_atlas)).tile("room").map.name
     file.write_bytes(file.read_bytes()[:-1] + b"x")
     with pytest.raises(AtlasError, match="its checksum is another"):
-        edit_tile(str(own_atlas), "room", lambda path: None)
+        Atlas.open(str(own_atlas)).edit("room", lambda path: None)
     assert (own_atlas / "atlas.json").read_bytes() == before
     assert list(scratch.iterdir()) == []
 

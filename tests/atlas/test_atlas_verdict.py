@@ -1,4 +1,4 @@
-"""The results of several tiles as one: the reported pose, the refusals, the probabilities."""
+"""Test the merge of several tiles' results: the reported pose, refusals and probabilities."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from made_hypotheses import WEIGHTS, believed, made_hypothesis
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.store import FolderStore
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.answer import Answer
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.provenance import Evidence, Provenance
 from topoloc.localization.result import CandidateNode, Localization, NotLocalized
 from topoloc.localization.tiles.atlas_tiles import AtlasTiles
-from topoloc.localization.tiles.tiles import TileResult, merge_tile_results
+from topoloc.localization.tiles.tiles import TileAnswer, merge_answers
 
 STRONG = Evidence(200, 150, 400, 500, 20, 0.9, 0.05, 0.7)
 FAIR = Evidence(100, 30, 80, 400, 20, 0.5, 0.15, 0.15)
@@ -56,20 +58,27 @@ Found = tuple[Tile, Localization | NotLocalized]
 
 
 def _merge(*found: Found, coarse: int = -1) -> Localization | NotLocalized:
-    """Merge the results of exhaustive searches; the one of this number was searched coarse only."""
+    """Merge the results of exhaustive searches. Tile number `coarse` was searched coarse only."""
     manifest = Manifest(tiles=tuple(tile for tile, _ in found))
     atlas = Atlas(FolderStore(Path("no-such-folder")), manifest)
     tiles = AtlasTiles(atlas, MapCache([], Localizer, 1), AtlasConfig(), lambda text: None)
-    results = [
-        TileResult(
-            tile.tile_id,
-            result,
-            [(result, NO_INLIERS)] if isinstance(result, Localization) else [],
-            number != coarse,
-        )
+    answers = [
+        TileAnswer(tile.tile_id, _answer(result), number != coarse)
         for number, (tile, result) in enumerate(found)
     ]
-    return merge_tile_results(tiles, results)[0]
+    return merge_answers(tiles, answers)[0]
+
+
+def _answer(result: Localization | NotLocalized) -> Answer:
+    """Return the answer of a map with this result."""
+    search = believed([])
+    if isinstance(result, NotLocalized):
+        return Answer(search, None, result, [])
+    assert result.evidence is not None
+    hypothesis = replace(
+        made_hypothesis(WEIGHTS.log_odds(result.evidence)), evidence=result.evidence
+    )
+    return Answer(search, hypothesis, result, [(result, NO_INLIERS)], [hypothesis])
 
 
 def test_the_only_tile_that_vouches_answers():

@@ -1,4 +1,5 @@
-"""A changed or damaged file of an atlas costs one tile at most, and `--check` finds it."""
+"""Check that a changed or damaged file of an atlas affects one tile at most, and that
+`--check` finds it."""
 
 from __future__ import annotations
 
@@ -52,7 +53,7 @@ def test_check_compares_the_manifest_with_the_maps(
 
 
 def test_check_compares_places_on_earth(room_map: Path, other_map: Path, tmp_path: Path):
-    """Of a tile that is georeferenced itself. The other one follows from it."""
+    """The check covers a tile with its own georeference. The other tile's place follows from it."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     assert main(["georeference", str(path), "--origin", "50.8,4.7,30,0"]) == 0
     where = tmp_path / "campus"
@@ -77,7 +78,7 @@ def _places(where: Path) -> Path:
 
 @pytest.fixture
 def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """No index of another test."""
+    """Set a cache of this test, without an index of other tests."""
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
 
 
@@ -101,7 +102,7 @@ def test_damaged_global_descriptors_cost_one_warning(own_atlas: Path):
 @pytest.mark.usefixtures("own_cache")
 @pytest.mark.parametrize("save", [np.savez_compressed, np.savez])
 def test_more_rows_than_nodes_are_refused(own_atlas: Path, save: Callable[..., None]):
-    """Even if the manifest has their checksum."""
+    """The manifest has the matching checksum."""
     path = _places(own_atlas)
     with np.load(path) as stored:
         rows = np.repeat(stored["surf"][:1], 1000, axis=0)

@@ -1,5 +1,5 @@
-"""The index lies in files that are made once, go on with an atlas that grows and shrinks, and are
-made anew where they are damaged."""
+"""Test the files of the index: they are made once, follow changes of the atlas, and are
+rebuilt if damaged."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ PLACES_A_TILE = 60
 
 @dataclass(eq=False)
 class Campus:
-    """An atlas whose places are made up; it remembers which tiles' vectors were read."""
+    """Hold an atlas with random global descriptors, and record which tiles'
+    descriptors are read."""
 
     folder: Path
     vectors: dict[str, np.ndarray] = field(default_factory=dict)
@@ -75,7 +76,7 @@ class Campus:
         return {"surf": self.vectors[tile.tile_id]}
 
     def check(self, opened: OpenedIndex) -> None:
-        """Each tile is found by a picture of one of its places, and as like it as it is."""
+        """Check that an image of one of its places finds each tile, with the right similarity."""
         for name, rows in self.vectors.items():
             asked = rows[7] + 0.03 * self.rng.standard_normal(128).astype(np.float32)
             asked /= np.linalg.norm(asked)
@@ -95,7 +96,7 @@ class Campus:
 
 @pytest.fixture
 def campus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Campus:
-    """Twelve tiles; more than 500 places are a shard, which holds at most 900."""
+    """Return twelve tiles. More than 500 places make a shard, which holds at most 900."""
     monkeypatch.setattr(index_files, "MAX_EXACT_DESCRIPTORS", 500)
     monkeypatch.setattr(index_files, "SHARD_DESCRIPTORS", 900)
     monkeypatch.setattr(descriptor_shard, "MAX_ROWS_COMPARED", 100)

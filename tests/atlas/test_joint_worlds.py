@@ -1,5 +1,5 @@
-"""Joins adjusted as a pose graph of worlds, kept by the manifest, and refused where they cannot
-be."""
+"""Test joins: they are adjusted as a pose graph of worlds, stored in the manifest, and refused
+if impossible."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topoloc.atlas.joins import Join
-from topoloc.atlas.joint_worlds import adjust_joins
+from topoloc.atlas.joint_worlds import Join, adjust_joins
 from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
@@ -118,8 +117,8 @@ def test_uncertainty_grows_with_the_way():
 
 
 def test_joins_do_not_move_what_knows_its_place_on_earth():
-    """b and d are 1 km apart by their georeferences; joins that bring them together by c are wrong,
-    the weaker is left out."""
+    """Georeferences place b and d 1 km apart. Joins that connect them by c are wrong, so the weaker
+    join is dropped."""
     on_earth: Mapping[str, Rigid3] = {
         "b": Rigid3.identity(),
         "d": Rigid3(np.eye(3), np.array([1000.0, 0.0, 0.0])),

@@ -1,4 +1,4 @@
-"""Tiles that are known to lie elsewhere are not asked; those of which nothing is known are."""
+"""Check that a location prior excludes only tiles with a known place out of reach."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from topoloc.localization.result import Localization, NotLocalized
 
 
 def _tile(name: str, origin: GeoPoint | None = None, world: str | None = None) -> Tile:
-    """A box of 10 by 10 metres; where it is georeferenced it begins at its origin."""
+    """Return a tile with a box of 10 by 10 metres. If it is georeferenced, the box begins
+    at its origin."""
     stored, box = (
         StoredFile(f"tiles/{name}.topo", "ab" * 32, 10),
         np.array([[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]]),

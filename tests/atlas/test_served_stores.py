@@ -1,5 +1,5 @@
-"""Atlases in object stores behind the service: they answer as one in a folder does, and a store
-that fails or is silent holds nobody up."""
+"""Test the service of atlases in object stores: results equal a folder's, and a silent store
+blocks no client."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from topoloc.apps.service.application import create_application
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.stores.object_store import ObjectStore
 from topoloc.atlas import tile_fetcher
-from topoloc.atlas.atlas import Atlas, store_at
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
 from topoloc.atlas.map_cache import MapCache
+from topoloc.atlas.store import store_at
 from topoloc.atlas.tile_fetcher import TileFetcher, TilePending
 from topoloc.errors import AtlasError, MapError, ObjectStoreError
 from topoloc.localization.localizer import Localizer
@@ -36,7 +37,7 @@ def store(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> str:
-    """An atlas of the tiles `room` and `other` in an object store."""
+    """Return an atlas of the tiles `room` and `other` in an object store."""
     where = (
         f"{request.getfixturevalue('s3_bucket')}/campus"
         if request.param == "s3"
@@ -50,7 +51,7 @@ def store(
 def in_memory(
     room_map: Path, other_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> str:
-    """The same in a store in memory, which does what a test says."""
+    """Return the same atlas in a store in memory, which a test can control."""
     where = _in_memory(tmp_path, monkeypatch)
     create_atlas(where, new_tiles([str(room_map), str(other_map)]))
     return where
@@ -66,7 +67,7 @@ def _in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 def _served(
     *sources: object, fetch_s: float = 20.0, max_bytes: int = 100_000_000
 ) -> Iterator[tuple[TestClient, MapCache]]:
-    """A service of these with one worker."""
+    """Run a service of these sources with one worker."""
     config = ServiceConfig(workers=1, fetch_s=fetch_s)
     maps = MapCache(
         [str(source) for source in sources], Localizer, max_bytes, TileFetcher(config.fetch_s).path
@@ -94,7 +95,7 @@ def _asked(client: TestClient, path: str, queries: Path) -> Any:
 
 
 def _timeless(answer: Any) -> Any:
-    """Without what differs from one asking to the next."""
+    """Return the answer without the parts that differ between requests."""
     if isinstance(answer, dict):
         return {
             name: _timeless(value)
@@ -183,7 +184,7 @@ def test_a_look_reads_no_manifest_that_it_knows(in_memory: str, monkeypatch: pyt
 
 @pytest.fixture
 def silent_tiles(in_memory: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """Maps do not come out of the store in memory until the event is set."""
+    """Delay the maps of the store in memory until the event is set."""
     speaks, kind = threading.Event(), type(ObjectStore(in_memory)._objects)
     get = kind.get
 

@@ -1,5 +1,5 @@
-"""Commands that edit a map edit the tile of an atlas as they do a map file, and `undo` takes it
-back to the byte."""
+"""Check that edit commands change a tile of an atlas like a map file, and that `undo` restores it
+byte-identical."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.atlas.manifest import Manifest
-from topoloc.atlas.place import edit_tile
 from topoloc.mapping.edit import edit_map, undo_edit
 
 Complaint = Callable[..., str]
@@ -94,7 +93,7 @@ def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(
 def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
     own_atlas: Path, complaint: Complaint
 ):
-    edit_tile(str(own_atlas), "room", _note)
+    Atlas.open(str(own_atlas)).edit("room", _note)
     atlas = Atlas.open(str(own_atlas))
     (kept,) = atlas.tile("room").previous
     assert Manifest.from_bytes(atlas.manifest.to_bytes(), "here").by_id["room"].previous == (kept,)
@@ -102,8 +101,8 @@ def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     assert "checksum" in (atlas.find_problem("room") or "")
     assert "checksum" in complaint("undo", own_atlas, "--tile", "room")
-    edit_tile(str(own_atlas), "other", _note)
-    undone = edit_tile(str(own_atlas), "other", undo_edit)
+    Atlas.open(str(own_atlas)).edit("other", _note)
+    undone = Atlas.open(str(own_atlas)).edit("other", undo_edit)
     assert undone.name == "note"
 
 
@@ -150,7 +149,7 @@ def test_an_edit_in_an_object_store_is_taken_back(
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
     where = f"memory:///{uuid4().hex}/campus"
     create_atlas(where, new_tiles([str(room_map)]))
-    edit_tile(where, "room", _note)
+    Atlas.open(where).edit("room", _note)
     assert len(Atlas.open(where).tile("room").previous) == 1
     assert main(["undo", where, "--tile", "room"]) == 0
     atlas = Atlas.open(where)

@@ -1,4 +1,4 @@
-"""What the demo says of its results follows from them."""
+"""Check that the demo's texts follow from its results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of wrong answers, and certificates in map files."""
+"""Test bounds of the rate of wrong poses, and certificates in map files."""
 
 from __future__ import annotations
 
@@ -53,8 +53,7 @@ def test_the_threshold_is_the_least_that_keeps_the_limit(worst: list[float], lim
 
 
 def test_the_promise_holds_on_answers_that_it_did_not_see():
-    """1,000 maps whose answers are wrong with a chance that falls with p: at most 5 % of the
-    promises may fail."""
+    """In 1,000 maps the error rate falls with p. At most 5 % of the certificates may fail."""
     random, num_broken = np.random.default_rng(5), 0
     for _ in range(1000):
         p = random.uniform(0.5, 1.0, 500)

@@ -1,4 +1,4 @@
-"""Numbers of evaluations whose answers are known."""
+"""Test the figures of evaluations with known results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking a map about frames with and without truth."""
+"""Test queries of frames with and without ground truth."""
 
 from __future__ import annotations
 

@@ -1,12 +1,11 @@
-"""Errors that one rigid transform explains are told from errors that are errors."""
+"""Check that errors of one rigid transform are distinguished from pose errors."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from topoloc.evaluation.metrics import EvaluatedQuery
-from topoloc.evaluation.world_alignment import fit_worlds
+from topoloc.evaluation.metrics import EvaluatedQuery, fit_worlds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
 
@@ -16,8 +15,8 @@ MAP_FROM_TRUTH = Rigid3.exp(np.array([3.0, -1.0, 0.5, 0.1, -0.2, 0.3]))
 def answers(
     map_from_truth: Rigid3, noise: float, num_wrong: int = 0, num: int = 20
 ) -> list[EvaluatedQuery]:
-    """Poses along a straight way, each off by `noise` (metres, radians), some of them anywhere; and
-    one refusal."""
+    """Return poses along a straight path, each with an error of `noise` (metres, radians), some at
+    random places, and one refusal."""
     rng, found = (
         np.random.default_rng(0),
         [EvaluatedQuery("none", NotLocalized("not_in_map"), Rigid3.identity(), recording="walk")],

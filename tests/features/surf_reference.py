@@ -1,5 +1,4 @@
-"""A slow retelling in NumPy of what OpenCV's SURF does for orientation and descriptor: the
-yardstick of the tests."""
+"""Compute orientation and descriptor of OpenCV's SURF slowly in NumPy, as a reference for tests."""
 
 from __future__ import annotations
 
@@ -71,7 +70,7 @@ def _descriptor(image: np.ndarray, x: float, y: float, s: float, angle_deg: floa
 
 
 def describe_as_opencv(image: np.ndarray, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angles in degrees (n,) and descriptors (n, 64) of key points (n, 3) = x, y, size."""
+    """Return angles in degrees (n,) and descriptors (n, 64) of key points (n, 3) = x, y, size."""
     integral = cv2.integral(image)
     angles_deg, descriptors = [], []
     for x, y, size in keypoints.tolist():

@@ -1,4 +1,4 @@
-"""Dense descriptors: they agree with a map point where it is seen, and not where it is not."""
+"""Check that dense descriptors agree with a map point at its pixel, and not at other pixels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _scene(rows: int = 24, columns: int = 32, size: int = 16) -> np.ndarray:
 
 
 def _of_points(planes: np.ndarray, points_img: np.ndarray) -> np.ndarray:
-    """The unit descriptors in whose grid step these pixels lie."""
+    """Return the unit descriptors of the grid cells that contain these pixels."""
     columns, rows = np.floor((points_img.T + 0.5) / STRIDE).astype(int)
     descriptors = planes[:, rows, columns].T
     return np.ascontiguousarray(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))

@@ -26,8 +26,8 @@ def picture(seed: int = 0) -> np.ndarray:
 
 
 def darkened(image: np.ndarray, seed: int = 0) -> np.ndarray:
-    """A third of the light, falling off to a tenth at the right, a gamma curve, and the sensor's
-    noise."""
+    """Return the image with a third of the light, falling to a tenth at the right, a gamma
+    curve and noise."""
     light = image / 255 / 3 * np.linspace(1.0, 0.3, image.shape[1])
     noise = np.random.default_rng(seed).normal(0, 4, image.shape)
     return np.clip(np.rint(255 * light**0.6 + noise), 0, 255).astype(np.uint8)
@@ -76,7 +76,8 @@ def test_pictures_without_anything_have_no_features(kind, image):
 
 
 def num_right(query: np.ndarray, train: np.ndarray, config: FeatureConfig) -> int:
-    """Matches of two pictures of the same view that lie within 3 pixels of where they should."""
+    """Count the matches of two images of the same view that are within 3 pixels of
+    the right place."""
     a, b = extract_features(query, config), extract_features(train, config)
     matches = match_features(a.descriptors, b.descriptors, MatchingConfig())
     off = a.points_img[matches.query_idx] - b.points_img[matches.train_idx]

@@ -41,7 +41,7 @@ def test_an_unknown_kind_is_told_with_those_that_there_are():
 
 @pytest.fixture(scope="module")
 def shared_picture() -> np.ndarray:
-    """Blobs and edges of all sizes."""
+    """Return an image of blobs and edges of all sizes."""
     rng, picture = np.random.default_rng(0), np.full((240, 320), 128.0)
     for _ in range(400):
         x, y, half = rng.integers(0, 320), rng.integers(0, 240), int(2 + rng.exponential(6.0))

@@ -1,4 +1,4 @@
-"""Features that a network gives, asked of networks that are made here."""
+"""Test features of a network, with networks made by the tests."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ CONFIG = ("xfeat", 64, 1000, 0.05)
 
 @pytest.fixture
 def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """XFeat's file: the picture is its own scores."""
+    """Write XFeat's file as a network that returns the image as its scores."""
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path))
     return write_network(tmp_path / "xfeat.onnx")
 
 
 def _bumps(centres: list[tuple[float, float]], height: int, width: int) -> np.ndarray:
-    """Scores with a Gaussian bump around each (x, y), the first the highest: the logarithm of each
-    is a parabola."""
+    """Return scores with a Gaussian bump around each (x, y), so that their logarithm is a parabola.
+    The first bump is the highest."""
     y, x = np.mgrid[:height, :width]
     bumps = [
         (0.9 - 0.1 * k) * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8.0)
@@ -95,7 +95,7 @@ def test_weak_ones_and_those_beside_stronger_ones_are_none_and_of_equals_there_i
 
 
 def test_key_points_are_what_no_window_exceeds():
-    """Against all windows of random scores of few values, so that many are equal."""
+    """Compare with all windows of random scores. Few values make many of them equal."""
     scores = np.random.default_rng(7).integers(0, 30, (40, 56)).astype(np.float32) / 30
     pixels, found = find_maxima(scores, 37, 50, 4, np.float32(0.3))
     expected = []
@@ -114,7 +114,7 @@ def test_key_points_are_what_no_window_exceeds():
 
 
 def _bilinear(dense: np.ndarray, points: np.ndarray, stride: float) -> np.ndarray:
-    """In NumPy; beyond the outermost points of the grid it goes on as they are."""
+    """Interpolate in NumPy. Beyond the outermost points of the grid, the values stay constant."""
     rows, columns = dense.shape[1:]
     u, v = (
         np.clip((points[:, k] + 0.5) / stride - 0.5, 0, n - 1) for k, n in ((0, columns), (1, rows))

@@ -157,8 +157,8 @@ def test_the_wider_radius_of_the_two_decides():
 @pytest.mark.parametrize("num_train", [TILE - 1, TILE, TILE + 1, 3 * TILE + 7])
 @pytest.mark.parametrize("ratio", [0.0, 0.8, 0.95])
 def test_the_nearest_and_its_rivals_are_those_of_the_whole_table(num_train: int, ratio: float):
-    """Whatever tile and lane they lie in; of equal ones the first, and columns that only fill the
-    last tile never."""
+    """Cover each tile and lane. Of equal descriptors the first matches, and padding
+    columns never match."""
     train = random_descriptors(1, num_train)
     query = blurred(train[np.random.default_rng(4).integers(0, num_train, 70)], 2, 0.15)
     train[num_train // 2] = blurred(query[7:8], 2, 0.1)[0]
@@ -193,7 +193,8 @@ def test_broken_map_descriptors_are_nobodys_match_and_break_no_other():
 
 @pytest.mark.parametrize("method", ["exact", "flann"])
 def test_more_of_the_same_features_are_matched_as_if_they_were_the_first(method: str):
-    """Also mutual: one of the first loses its match to a later one that is nearer."""
+    """Mutual matching included: a later query feature that is nearer replaces the match of
+    an earlier one."""
     train = random_descriptors(0, 500)
     query = np.concatenate(
         [blurred(train[:120], 1, 0.1), random_descriptors(2, 81), blurred(train[:200], 3, 0.02)]

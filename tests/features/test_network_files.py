@@ -1,5 +1,5 @@
-"""Networks are found in the package or the cache, and a file that is none of them is told in one
-line."""
+"""Test that networks are found in the package or the cache, and that another file is
+refused in one line."""
 
 from __future__ import annotations
 

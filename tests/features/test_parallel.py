@@ -1,5 +1,5 @@
-"""Work shared out to threads: every row and item once and in order, errors raised, and a forked
-child has threads of its own."""
+"""Test work on threads: each row and item once and in order, raised errors, and threads of
+a forked child."""
 
 from __future__ import annotations
 

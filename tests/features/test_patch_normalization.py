@@ -11,8 +11,8 @@ def picture(seed: int, height: int, width: int, contrast: float = 255.0) -> np.n
 
 
 def naive(image: np.ndarray, config: PatchNormalizationConfig) -> np.ndarray:
-    """The paper's equation word for word, weights of the window given by its boxes; not yet
-    rounded."""
+    """Compute the paper's equation directly, with window weights from its boxes,
+    and do not round."""
     first, second = (np.ones(side) for side in config.box_sizes())
     profile = np.convolve(first, second)
     weights = np.outer(profile, profile) / profile.sum() ** 2

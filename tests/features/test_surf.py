@@ -1,5 +1,5 @@
-"""SURF against OpenCV's own numbers, on turned, shrunk and darkened images, and at the edges of
-what it may be given."""
+"""Test SURF against OpenCV's values, on rotated, shrunk and darkened images, and with
+extreme inputs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ ALL = 5000
 
 
 def load_reference(shared: Path, name: str, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The image, OpenCV's key points (x, y, size, angle in degrees, ...), strongest first, and
-    their descriptors."""
+    """Return the image, OpenCV's key points (x, y, size, angle in degrees, ...), strongest first,
+    and their descriptors."""
     path = shared / "reference" / "surf" / f"{name}.npz"
     if not path.is_file():
         pytest.skip(f"no reference values at {path}")
@@ -29,7 +29,7 @@ def load_reference(shared: Path, name: str, kind: str) -> tuple[np.ndarray, np.n
 
 
 def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
-    """Smooth noise of several scales, full contrast."""
+    """Return smooth noise of several scales with full contrast."""
     rng = np.random.default_rng(seed)
     layers = [
         cv2.resize(
@@ -107,7 +107,8 @@ def count_right_matches(
     other_descriptors: np.ndarray,
     affine: np.ndarray,
 ) -> int:
-    """Matches that pass Lowe's test at 0.8 and lie within 3 pixels of where the point has gone."""
+    """Count matches that pass Lowe's test at 0.8 and lie within 3 pixels of the
+    transformed point."""
     squares = np.maximum(2 - 2 * descriptors @ other_descriptors.T, 0)
     two = np.argsort(squares, axis=1)[:, :2]
     best, second = np.take_along_axis(squares, two, axis=1).T
@@ -119,8 +120,8 @@ def count_right_matches(
 @pytest.mark.parametrize("change", [turn, shrink, darken])
 @pytest.mark.parametrize("name", ["kitchen", "zed"])
 def test_as_many_right_matches_as_opencv(shared: Path, name: str, change) -> None:
-    """Within 3 %: which of two images does a little better is chance; over many images and changes
-    they are even."""
+    """Allow 3 %. For one pair of images the better one is random, and over many images
+    they are equal."""
     image, keypoints, descriptors = load_reference(shared, name, "rotated")
     changed, affine = change(image)
     ours, theirs = extract_surf(image, max_features=ALL), extract_surf(changed, max_features=ALL)
@@ -207,8 +208,8 @@ def test_read_only_and_strided_images() -> None:
 
 
 def test_sums_beyond_32_bits_wrap_harmlessly() -> None:
-    """A white image of 17 megapixels sums to more than 2^32; a patch in its far corner is described
-    as on its own."""
+    """The sum of a white image of 17 megapixels exceeds 2^32. A patch in its far corner has the
+    same features as alone."""
     patch = texture(200, 200)
     framed = np.full((4200, 4100), 255, np.uint8)
     framed[-300:-100, -300:-100] = patch

@@ -1,5 +1,5 @@
-"""Views to the left and to the right: the same rays, a wall without slant, nothing that the picture
-does not hold."""
+"""Test virtual views to the left and right: equal rays, a wall without slant, and no pixel
+outside of the image."""
 
 from __future__ import annotations
 
@@ -43,9 +43,8 @@ def features_at(points_img: np.ndarray) -> Features:
 
 
 def wall(name: str, texture: np.ndarray) -> Panel:
-    """A wall along the way, a metre to this side of a camera at `WORLD_FROM_CAM`, that begins where
-    the camera stands; its texture is upright and reads from left to right for who stands before
-    it."""
+    """Return a wall along the path, one metre to this side of the camera at `WORLD_FROM_CAM`. It
+    begins beside the camera, and its texture is upright and not mirrored."""
     along = np.array([0.0, -SIDES[name], 0.0])
     half = (texture.shape[1] / TEXELS_PER_METRE / 2.0, texture.shape[0] / TEXELS_PER_METRE / 2.0)
     return Panel(
@@ -58,7 +57,7 @@ def view_of(name: str, camera: Camera) -> VirtualView:
 
 
 def seen(name: str, camera: Camera, texture: np.ndarray) -> tuple[VirtualView, np.ndarray]:
-    """What the side view shows of such a wall."""
+    """Return the virtual view of such a wall, and its image."""
     view, (picture, _) = (
         view_of(name, camera),
         render([wall(name, texture)], WORLD_FROM_CAM, camera),
@@ -112,7 +111,7 @@ def test_a_pixel_and_where_it_lies_in_the_picture_are_one_direction(
 def test_features_between_pixels_are_the_points_of_the_same_wall_in_the_picture(
     camera: Camera, side: int, seed: int
 ):
-    """The point of the wall is found without the view's own tables."""
+    """Compute the point of the wall without the view's own tables."""
     view, rng = make_virtual_views(camera)[side], np.random.default_rng(seed)
     ahead, up, distance = (
         rng.uniform(1.7, 2.8, 20),
@@ -146,7 +145,7 @@ LETTER = np.array(
 
 
 def in_grey(cells: np.ndarray, cell_m: float) -> np.ndarray:
-    """A texture whose cells have this size (metres)."""
+    """Return a texture with cells of this size (metres)."""
     return np.kron(40.0 + 170.0 * cells, np.ones((round(cell_m * TEXELS_PER_METRE),) * 2)).astype(
         np.float32
     )
@@ -181,8 +180,8 @@ def test_lettering_on_a_wall_stays_readable(name: str, camera: Camera):
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize("name", SIDES)
 def test_a_wall_along_the_way_has_the_same_scale_everywhere(name: str, camera: Camera):
-    """Bars of 0.2 m come out evenly, from the nearest to the farthest; a pixel of the slanted wall
-    is up to 4 cm wide."""
+    """Bars of 0.2 m have equal widths from near to far. A pixel of the slanted wall
+    covers up to 4 cm."""
     view, picture = seen(
         name, camera, in_grey(np.tile(np.arange(18) % 2, (5, 1)).astype(np.float32), 0.2)
     )

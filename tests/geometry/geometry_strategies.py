@@ -1,4 +1,4 @@
-"""What hypothesis draws for the tests of geometry."""
+"""Define hypothesis strategies for the tests of geometry."""
 
 import numpy as np
 from hypothesis import strategies as st

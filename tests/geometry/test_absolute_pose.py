@@ -37,8 +37,8 @@ def make_scene(
     sigma_px: float = 0.0,
     depth_noise: float = 0.0,
 ) -> Scene:
-    """Points seen by a camera at a random pose; `depth_noise` d moves them along the ray of a
-    mapping camera by d z^2 (1 sigma)."""
+    """Return points seen by a camera at a random pose. `depth_noise` d moves them along the ray of
+    a mapping camera by d z^2 (1 sigma)."""
     cam_from_world = random_rigid(rng)
     pixels = rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (n, 2))
     points_cam = np.column_stack([camera.normalized_from_img(pixels), np.ones(n)]) * rng.uniform(
@@ -215,8 +215,8 @@ def test_matches_that_are_not_finite_are_outliers(method):
 def mean_normalized_error(
     camera: Camera, num_trials: int, config: AbsolutePoseConfig | None = None, **noise: float
 ) -> float:
-    """Mean of xi' C^-1 xi with the error xi as left perturbation: 6 where the covariance C is
-    right."""
+    """Return the mean of xi' C^-1 xi with the error xi as left perturbation. It is 6 if the
+    covariance C is right."""
     rng = np.random.default_rng(7)
     errors = []
     for _ in range(num_trials):

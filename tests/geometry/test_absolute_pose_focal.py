@@ -1,5 +1,4 @@
-"""Pose and focal length of a camera that nobody has calibrated, from exact and from noisy
-matches."""
+"""Test pose and focal length of an uncalibrated camera, from exact and from noisy matches."""
 
 from __future__ import annotations
 
@@ -10,13 +9,13 @@ from topoloc.errors import CalibrationError
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.camera import UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
     WeighedCamera,
 )
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 
 CAM_FROM_WORLD = Rigid3(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 1.0]))
 UNKNOWN = UncalibratedCamera.unknown(640, 480)
@@ -109,8 +108,8 @@ def test_the_same_matches_give_the_same_bytes_and_useless_ones_change_nothing():
 
 
 def test_the_inliers_gather_where_some_are_near_and_most_are_far():
-    """What is near agrees with a wrong focal length, too: a few rounds leave it at that, and the
-    far ones out."""
+    """Near points also agree with a wrong focal length. A few rounds keep only them, without
+    the far points."""
     street = UncalibratedCamera.unknown(1241, 376)
     for seed in range(12):
         rng, camera = np.random.default_rng(seed), street.with_focal(720.0)
@@ -234,7 +233,7 @@ def test_radial_distortion_is_estimated_with_the_pose(k1: float):
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_a_fisheye_lens_does_not_look_off_centre(side: float):
-    """A cubic term does not follow the lens to its edge, and most points lie to one side."""
+    """A cubic term does not fit the lens up to its edge, and most points lie to one side."""
     rng, focal = np.random.default_rng(7), 250.0
     pixels, points, covariances = _scene(focal / 2.0, rng, num=900, noise_px=0.5)
     rays = UNKNOWN.with_focal(focal / 2.0).normalized_from_img(pixels)
@@ -252,7 +251,7 @@ def test_a_fisheye_lens_does_not_look_off_centre(side: float):
 
 @pytest.mark.parametrize("start_px", [590.0, 610.0])
 def test_a_start_outside_the_stated_range_moves_both_ways(start_px: float):
-    """A crop keeps the focal length that EXIF data state for the whole image. Of seven points no
+    """A crop keeps the focal length that EXIF data state for the whole image. With seven points, no
     other camera parameters are estimated."""
     pixels, points, covariances = _scene(600.0, np.random.default_rng(8), num=7)
     stated = UncalibratedCamera.from_focal_guess(640, 480, 300.0)

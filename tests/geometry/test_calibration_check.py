@@ -1,4 +1,4 @@
-"""What a picture says of its camera, from points whose pixels are known."""
+"""Test the calibration estimate from one image, with points at known pixels."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ CAM_FROM_WORLD = Rigid3(exp_so3(np.array([0.1, -0.4, 0.2])), np.array([0.3, -0.2
 def room(
     rng: np.random.Generator, num_points: int = 300
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels with half a pixel of noise, points of 2 to 8 m depth, and their covariances."""
+    """Return pixels with half a pixel of noise, points of 2 to 8 m depth, and their covariances."""
     pixels = rng.uniform([20.0, 20.0], [620.0, 460.0], (num_points, 2))
     rays = np.column_stack([TRUE.normalized_from_img(pixels), np.ones(num_points)])
     points = CAM_FROM_WORLD.inverse().apply(rays * rng.uniform(2.0, 8.0, (num_points, 1)))

@@ -1,4 +1,5 @@
-"""What many pictures say of one camera: more than each of them, and not more than they know."""
+"""Test the calibration estimate from many images of one camera: more exact than one image, and not
+overconfident."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ def pictures(
     rng: np.random.Generator,
     num_places: int | None = None,
 ) -> list[IntrinsicsDeviation]:
-    """Each with noise of its own size, as its covariance says; pictures of one place share it."""
+    """Return deviations, each with noise as its covariance states. Images of one place
+    share the noise."""
     seen = []
     places = np.arange(num) % (num_places or num)
     noise = rng.normal(size=(num, 3))

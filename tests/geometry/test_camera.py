@@ -15,7 +15,7 @@ depths = st.floats(0.1, 100.0)
 
 
 def grid(camera: Camera, num: int = 21) -> np.ndarray:
-    """Pixels all over the image, its corners included."""
+    """Return pixels all over the image, its corners included."""
     x, y = np.meshgrid(
         np.linspace(0.0, camera.width - 1.0, num), np.linspace(0.0, camera.height - 1.0, num)
     )

@@ -1,4 +1,4 @@
-"""Errors that matches near each other share are seen, and told from errors of their own."""
+"""Check that errors which near matches share are detected, unlike independent errors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import compute_variance_inflation
+from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -16,8 +16,8 @@ NO_COVARIANCES = np.zeros((300, 3, 3))
 
 
 def seen(seed: int, moved: float, count: int = 300) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels with noise of one pixel, and points; half of the things that fill the picture were
-    moved, by metres of this deviation."""
+    """Return pixels with one pixel of noise, and points. Half of the objects in view were moved, by
+    `moved` metres (1 sigma)."""
     rng = np.random.default_rng(seed)
     exact = rng.uniform([10.0, 10.0], [629.0, 469.0], (count, 2))
     depths = rng.uniform(2.0, 6.0, count)
@@ -29,8 +29,8 @@ def seen(seed: int, moved: float, count: int = 300) -> tuple[np.ndarray, np.ndar
 
 
 def coherence_of(seed: int, moved: float) -> tuple[float, float]:
-    """And the pose's squared error in standard deviations of a covariance that takes all errors for
-    independent."""
+    """Return the coherence, and the pose's squared error in standard deviations under
+    independent errors."""
     points_img, points = seen(seed, moved)
     pose = estimate_absolute_pose(
         points_img, points, CAMERA, CONFIG, point_covariances=NO_COVARIANCES

@@ -1,4 +1,4 @@
-"""WGS-84 as PROJ has it, and GeoPoses."""
+"""Test WGS-84 against PROJ, and GeoPoses."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def test_east_north_up_is_that_of_proj(lat: float, lon: float, h: float, east: f
 
 
 def test_axes_of_a_geopose():
-    """In a world that lies east-north-up a camera that looks east is a body that is not turned at
-    all; one that looks north is turned by a quarter about up."""
+    """In an east-north-up world, a camera that looks east is a body without rotation. A camera that
+    looks north is rotated by 90 degrees about up."""
     world = Georeference(GeoPoint(0.0, 0.0, 0.0), Rigid3.identity(), "test")
     looks_east = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     np.testing.assert_allclose(
@@ -76,7 +76,7 @@ def test_axes_of_a_geopose():
 
 
 def test_up_is_that_of_the_cameras_own_place():
-    """100 km east of the origin the plane there has turned by 0.9 degrees."""
+    """100 km east of the origin, the local horizontal plane differs by 0.9 degrees."""
     world = Georeference(GeoPoint(0.0, 10.0, 0.0), Rigid3.identity(), "test")
     geopose = world.geopose(Rigid3(np.eye(3), np.array([1e5, 0.0, 0.0])))
     at_origin = world.geopose(Rigid3.identity())

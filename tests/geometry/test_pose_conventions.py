@@ -1,4 +1,4 @@
-"""Every convention undoes what it names."""
+"""Check that each convention undoes the change that it names."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def assert_same(a: Rigid3, b: Rigid3) -> None:
 
 
 def with_axes(pose: Rigid3, right: list[float], down: list[float], forward: list[float]) -> Rigid3:
-    """The pose of a body of other axes at the camera, in which the camera's point so."""
+    """Return the pose of a body whose axes point to these directions of the camera."""
     return Rigid3(pose.rotation @ np.column_stack([right, down, forward]).T, pose.translation)
 
 

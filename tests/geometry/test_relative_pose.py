@@ -1,5 +1,5 @@
-"""The motion of a single camera between two pictures: turn and direction, among wrong matches;
-nothing where it cannot be seen."""
+"""Test the motion of a single camera between two images: rotation and direction despite wrong
+matches, or nothing."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ SECOND = Camera("OPENCV", 640, 480, (420.0, 421.0, 318.0, 241.0, -0.05, 0.01, 0.
 
 
 def seen(second_from_first: Rigid3, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """300 points 2 to 8 m away by pixels of both cameras, 0.3 pixels of noise, a third of them
-    wrong in the second."""
+    """Return pixels of 300 points, 2 to 8 m away, in both cameras, with 0.3 pixels of noise. A
+    third is wrong in the second image."""
     rng = np.random.default_rng(seed)
     depths = rng.uniform(2.0, 8.0, 300)
     points = np.column_stack([rng.uniform(-0.6, 0.6, (300, 2)) * depths[:, None], depths])

@@ -48,7 +48,7 @@ def rectification_of(name: str) -> Rectification:
 
 
 def euroc_camera(path: Path) -> tuple[Camera, Rigid3]:
-    """(camera, body_from_cam) of a sensor.yaml."""
+    """Return camera and body_from_cam of a sensor.yaml."""
 
     def numbers(key: str) -> list[float]:
         found = re.search(rf"^\s*{key}:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)
@@ -71,7 +71,7 @@ def euroc_camera(path: Path) -> tuple[Camera, Rigid3]:
 
 
 def sample(image_map: np.ndarray, x: float, y: float) -> np.ndarray:
-    """The map between its pixels, as remap's own interpolation would have it."""
+    """Interpolate the map between its pixels as remap does."""
     column, row = int(np.floor(x)), int(np.floor(y))
     a, b = x - column, y - row
     corners = image_map[row : row + 2, column : column + 2].astype(np.float64)

@@ -1,4 +1,4 @@
-"""A camera that turns while its rows are read."""
+"""Test poses of a camera that turns while its rows are read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SIGMA_PX = 0.7
 
 
 def _found(turn_deg: list[float], start: Rigid3 = CAM_FROM_WORLD) -> TurningCamera | None:
-    """Return what is found of 300 points whose rows were read while the camera turned."""
+    """Return the result for 300 points whose rows were read while the camera turned."""
     rng = np.random.default_rng(3)
     pixels = rng.uniform([0.0, 0.0], [640.0, 480.0], (300, 2))
     points_cam = np.column_stack([CAMERA.normalized_from_img(pixels), np.ones(300)])

@@ -1,4 +1,4 @@
-"""Absolute error and drift of trajectories whose error is known."""
+"""Test absolute error and drift with trajectories of known error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 def circle(
     num: int, radius: float = 10.0, yaw_error: float = 0.0, scale: float = 1.0
 ) -> list[Rigid3]:
-    """A camera going round in steps of one kind; with a yaw error a step, or steps too long."""
+    """Return a camera path around a circle in equal steps, with a yaw error per step or a
+    wrong step length."""
     step = Rigid3(
         exp_so3(np.array([0.0, 2 * np.pi / num + yaw_error, 0.0])),
         np.array([0.0, 0.0, scale * 2 * np.pi * radius / num]),

@@ -1,4 +1,4 @@
-"""Many estimates of one transform: what most of them say, and when nothing is said."""
+"""Test the consensus of many estimates of one transform, and when there is none."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ seeds = st.integers(0, 2**31)
 
 
 def random_covariances(rng: np.random.Generator, num: int) -> np.ndarray:
-    """Some of them three times as wide as others, no two of the same shape: a centimetre or two,
+    """Return covariances of different shapes and up to three times different widths: 1 to 2 cm,
     half a degree."""
     factors = (
         np.diag([0.01] * 3 + [0.005] * 3)
@@ -93,7 +93,7 @@ def test_estimates_of_different_transforms_are_no_consensus(seed):
     ("num_rivals", "is_believed"), [(0, True), (2, True), (3, False), (6, False)]
 )
 def test_as_likely_as_another_one_is_not_believed(num_rivals, is_believed):
-    """A panel further on: six say here, the others a metre beside it, as one."""
+    """Six estimates agree here. The others agree on a panel one metre beside it."""
     rng = np.random.default_rng(0)
     a_from_b, covariances = random_rigid(rng), random_covariances(rng, 6 + num_rivals)
     beside = Rigid3.exp(np.array([1.0, 0, 0, 0, 0, 0])) @ a_from_b

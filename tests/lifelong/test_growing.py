@@ -1,5 +1,5 @@
-"""A map that grows by pieces: a stretch that the map does not know joins once the camera comes
-back."""
+"""Test a map that grows by pieces: an unknown stretch joins when the camera returns
+to known places."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FAR = [7.5 - 0.135 * k for k in range(78)]
 
 @dataclass(eq=False, repr=False)
 class Interrupted(IndexedFrames):
-    """Stereo pairs along the corridor; those of None are dark."""
+    """Hold stereo pairs along the corridor. A pair at None is dark."""
 
     ys: list[float | None]
     name: str = "walk"
@@ -59,7 +59,7 @@ class Interrupted(IndexedFrames):
 
 
 def errors_m(topomap: TopoMetricMap, ys: list[float | None]) -> dict[float, float]:
-    """How far off (metres) each node is, by its place in the corridor."""
+    """Return the position error in metres of each node, by its place in the corridor."""
     first, off = ahead(FIRST[0]), {}
     for one in topomap.summaries:
         y = ys[int(one.name)]

@@ -1,4 +1,5 @@
-"""`topoloc prune --descriptors coarse`: a smaller file, in which the same is found."""
+"""Test `topoloc prune --descriptors coarse`: the file shrinks, and the same images
+are localized."""
 
 from __future__ import annotations
 

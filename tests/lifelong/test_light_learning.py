@@ -1,4 +1,4 @@
-"""`topoloc update` with a session of a single camera in another light: the demo's lab, mapped by
+"""Test `topoloc update` with a session of a single camera in other light: the demo's lab, mapped by
 day, by night."""
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def map_file(by_day: Path, tmp_path: Path) -> Path:
 
 
 def _errors_m(path: Path, recording: str | Path) -> list[float]:
-    """Of the images that get a pose; infinite without a true one."""
+    """Return the position errors of localized images, infinite without a true pose."""
     errors, sequence = list[float](), open_sequence(recording)
     with TopoMetricMap.load(path) as topomap:
         localizer = Localizer(topomap)
@@ -80,7 +80,7 @@ def test_a_night_is_learned_in_the_room_that_the_map_takes(
 def test_a_session_that_extends_the_map_keeps_its_room(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Images beyond the border of the map recognise more of each other than of the map, too."""
+    """Images beyond the border of the map recognise more of each other than of the map."""
     path = tmp_path / "half.topo"
     half = open_sequence(f"{LAB / 'map_lap1'}@0:20")
     build_map(half, BuildConfig(other_kinds=())).save(path)
@@ -136,7 +136,7 @@ def test_a_walk_elsewhere_is_refused(map_file: Path, complaint: Callable[..., st
 def test_images_that_show_nothing_where_their_poses_predict_it_teach_nothing(
     map_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """The map recognises the others, and knows where they are."""
+    """The map recognises the other images, and their poses are right."""
     night, ahead = open_sequence(TAUGHT), Rigid3(np.eye(3), np.array([0.0, 0.0, 0.3]))
     poses = [pose and (pose @ ahead if 6 <= k <= 8 else pose) for k, pose in enumerate(night.poses)]
     file = tmp_path / "wrong.tum"
@@ -149,7 +149,7 @@ def test_images_that_show_nothing_where_their_poses_predict_it_teach_nothing(
 
 
 def test_an_image_is_looked_for_between_its_neighbours(by_day: Path):
-    """A frame that is not there has an answer only if the map finds it near the middle."""
+    """A missing frame gets a pose only if the map finds one near the middle of its neighbours."""
     walk = open_sequence(LAB / "day")
     with TopoMetricMap.load(by_day) as topomap:
         localizer = Localizer(topomap)

@@ -1,4 +1,5 @@
-"""Depths of single images from the landmarks of a map, compared with those of the stereo pair."""
+"""Compare depths of single images, taken from landmarks of a map, with depths of
+the stereo pair."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ import numpy as np
 
 import topoloc.demo
 from topoloc import open_sequence
-from topoloc.lifelong.map_depth import MapPointLocator
+from topoloc.lifelong.session_content import MapPointLocator
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.mapping_frames import extract_mapping_image, select_posed_frames

@@ -1,5 +1,4 @@
-"""`topoloc merge`: two maps that were made apart become one where they overlap, and stay apart
-where they do not."""
+"""Test `topoloc merge`: two maps become one if they overlap, and stay apart otherwise."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ def _map_of(folder: Path, target: Path, moved: Rigid3) -> Path:
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Of the room's left part, and of its right part in a world of its own."""
+    """Return a map of the room's left part, and one of its right part in another world frame."""
     folder = tmp_path_factory.mktemp("parts")
     left = write_stereo_recording(folder / "left", indices=[float(k) for k in range(7)])
     right = write_stereo_recording(folder / "right", indices=SECOND.tolist())

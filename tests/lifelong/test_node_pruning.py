@@ -1,5 +1,5 @@
-"""Nodes that others hold go where a budget leaves every node few landmarks: the most redundant
-first, none that nothing else holds."""
+"""Check that pruning removes redundant nodes if the budget leaves few landmarks per node, and keeps
+each node that no other supports."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from topoloc.mapping.storage.integrity_check import find_map_damage
 
 
 def _holds(landmarks: list[list[int]], pictures: list[int]) -> NodeSupport:
-    """Of every node by every node."""
+    """Return the support of each node by each other node."""
     num = len(landmarks)
     by = np.array([[k, *(j for j in range(num) if j != k)] for k in range(num)])
     return NodeSupport(by, np.take_along_axis(np.array(landmarks), by, axis=1), np.array(pictures))
@@ -47,8 +47,8 @@ def test_what_nothing_else_holds_stays():
 
 
 def test_what_went_is_not_forgotten():
-    """Node 1 is held by 0 and by 2; once it is gone, 0 alone holds 1's place and may not go though
-    2 shows enough of 0."""
+    """Nodes 0 and 2 support node 1. After its removal only 0 supports its place and stays, though 2
+    shows enough of 0."""
     holds = _holds([[500, 300, 100], [300, 400, 30], [50, 30, 500]], [1, 1, 5])
     order = [row for row, _ in iterate_node_removals(holds, 60)]
     assert order == [1]

@@ -1,4 +1,4 @@
-"""How far a session's motion and the map's answers are trusted, as they tell of each other."""
+"""Test the noise scales of a session's motion and the map's poses, estimated from each other."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TRUTH = {
 
 
 def _answers(sigma_m: float, seed: int = 0) -> dict[int, Localization | None]:
-    """What a map answers that takes itself for `SIGMA_M` off, and is `sigma_m`."""
+    """Return poses of a map that states an error of `SIGMA_M` and has an error of `sigma_m`."""
     rng = np.random.default_rng(seed)
     scatter = np.diag([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
     answers = dict[int, Localization | None]()
@@ -35,7 +35,7 @@ def _answers(sigma_m: float, seed: int = 0) -> dict[int, Localization | None]:
 
 
 def _motion(sigma_m: float, seed: int = 1) -> dict[int, Rigid3]:
-    """The walk in a world of its own, each step off by so much."""
+    """Return the walk in its own world frame, with an error of `sigma_m` per step."""
     rng = np.random.default_rng(seed)
     poses = {0: Rigid3.identity()}
     for k in range(1, len(TRUTH)):

@@ -1,5 +1,5 @@
-"""`topoloc prune`: what later sessions never saw again goes, a size is kept, and what is left still
-localizes."""
+"""Test `topoloc prune`: landmarks that later sessions missed are removed, a size limit is met, and
+the map still localizes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _counts(num_points: int, expected: int, seen: np.ndarray) -> LandmarkStatist
 def _with_later_session(
     path: Path, seen_of: Callable[[int], np.ndarray], expected: int = 6
 ) -> None:
-    """As if a second session had looked at every node."""
+    """Add the statistics of a second session that observed each node."""
     with edit_map(path) as edit:
         topomap = edit.topomap
         nodes = []
@@ -99,7 +99,7 @@ def test_landmarks_that_are_gone_go_and_no_others(room_map: Path, tmp_path: Path
 
 
 def test_what_another_light_hides_is_not_gone(room_map: Path, tmp_path: Path):
-    """A session that saw a tenth of a node's landmarks again says nothing of the others."""
+    """A session that matches a tenth of a node's landmarks is no evidence about the others."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     _with_later_session(path, lambda num: np.where(np.arange(num) % 10 == 0, 6, 0))
     before = path.read_bytes()
@@ -108,8 +108,8 @@ def test_what_another_light_hides_is_not_gone(room_map: Path, tmp_path: Path):
 
 
 def test_what_chance_may_have_hidden_is_not_gone(room_map: Path, tmp_path: Path):
-    """A session that finds a third of what is in view misses a landmark in six pictures one time of
-    eleven."""
+    """A session that finds a third of the visible landmarks misses one in six images with
+    probability 1/11."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     _with_later_session(path, lambda num: np.where(np.arange(num) % 3 == 0, 6, 0))
     before = path.read_bytes()

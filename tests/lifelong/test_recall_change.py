@@ -1,4 +1,5 @@
-"""What an edit costs the sessions that the map already has, and that its history tells it."""
+"""Test the effect of an edit on the recall of the map's own sessions, and its entry
+in the history."""
 
 from __future__ import annotations
 

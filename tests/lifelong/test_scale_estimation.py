@@ -1,5 +1,5 @@
-"""The metres of a motion in a unit of its own: found by answers of a map, of which some are wrong,
-while the unit drifts."""
+"""Test the metric scale of a motion in unknown units. Some poses of the map are wrong, and
+the unit drifts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ WRONG = Rigid3(np.eye(3), np.array([2.0, 1.0, 0.0]))
 
 
 def _motion(drift: float) -> dict[int, Rigid3]:
-    """The motion in units of about half a metre, which grow by `drift` over the whole way."""
+    """Return the motion in units of about half a metre, which grow by `drift` over
+    the whole path."""
     position, own = np.zeros(3), {0: TRUTH[0]}
     for k in range(1, len(TRUTH)):
         position = position + (TRUTH[k].translation - TRUTH[k - 1].translation) * 2.0 * (
@@ -80,8 +81,8 @@ def test_where_the_unit_is_not_known_there_are_no_poses():
 
 
 def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
-    """The motion's beginning is wrong, and the map knows: four answers to it, and a picture among
-    them that it does not know."""
+    """The start of the motion is wrong. The map localizes four of its images and not the
+    one between them."""
     motion = _motion(0.0)
     for k in range(5):
         motion[k] = Rigid3(
@@ -96,7 +97,7 @@ def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
 
 
 def test_two_ways_that_the_map_answers_are_none():
-    """The greater part of the answers is of a place that looks alike from the other end."""
+    """The map localizes most images at a similar place in reverse direction."""
     turned = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.array([9.0, -3.0, 0.0]))
     answers = _answers([*range(0, 30, 2), *range(40, 60, 2)], [])
     for k in range(0, 30, 2):

@@ -1,5 +1,5 @@
-"""`topoloc atlas join`: tiles that overlap get one world, tiles of two places do not, however much
-these share."""
+"""Test `topoloc atlas join`: overlapping tiles get one world, and tiles of two places do not,
+however similar."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tiny_world import CAMERA, Panel, path_pose, render, room, write_stereo_reco
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins, add_tiles, create_atlas, new_tiles, remove_tiles
-from topoloc.atlas.joins import sigmas_at
+from topoloc.atlas.joint_worlds import sigmas_at
 from topoloc.atlas.location_prior import WorldPositionPrior, tiles_in_reach
 from topoloc.atlas.manifest import Manifest
 from topoloc.geometry.alignment import rotation_error, translation_error
@@ -63,7 +63,7 @@ def _built(sequence: SequenceView) -> TopoMetricMap:
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Maps of three parts of one walk that overlap."""
+    """Return maps of three overlapping parts of one walk."""
     folder = tmp_path_factory.mktemp("parts")
     return {
         name: _map_of(folder / name, [float(k) for k in PARTS[name]], WORLDS[name])
@@ -73,7 +73,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_nodes() -> Iterator[None]:
-    """The tiles have fewer nodes than a join takes."""
+    """Lower the number of nodes that a join needs, because these tiles have fewer."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("topoloc.lifelong.tiles.tile_joining.compare_tiles", FEW)
         yield
@@ -83,7 +83,7 @@ def few_nodes() -> Iterator[None]:
 def joined_once(
     parts: dict[str, Path], other_room: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, TileJoiningResult]:
-    """An atlas of the three, joined, and of another room; not to be written to."""
+    """Return an atlas of the three parts, joined, and of another room. Read-only."""
     where = tmp_path_factory.mktemp("atlas") / "campus"
     create_atlas(str(where), new_tiles([*map(str, parts.values()), str(other_room)]))
     return where, join_tiles(str(where))
@@ -96,7 +96,7 @@ def joined_atlas(joined_once: tuple[Path, TileJoiningResult]) -> tuple[Path, Man
 
 @pytest.fixture(scope="module")
 def other_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the same plan, with the same side wall and floor; all else is another room's."""
+    """Return a map of a room with the same plan, side wall and floor, in which all else differs."""
     panels = [
         own if k in (1, 2) else other
         for k, (own, other) in enumerate(zip(room(), room(9), strict=True))
@@ -111,7 +111,7 @@ def other_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def own(joined_atlas: tuple[Path, Manifest], tmp_path: Path) -> Path:
-    """A copy that may be written to."""
+    """Return a copy of the atlas that a test may change."""
     return Path(shutil.copytree(joined_atlas[0], tmp_path / "campus"))
 
 
@@ -156,8 +156,8 @@ def test_each_join_is_as_certain_as_it_says(joined_atlas: tuple[Path, Manifest])
 
 
 def test_a_room_of_the_same_plan_is_not_joined(joined_once: tuple[Path, TileJoiningResult]):
-    """Its side wall and floor are the same to the last spot: pictures of one are recognised in the
-    other, where they agree."""
+    """Its side wall and floor are equal, so that images of one room are recognised in the other
+    with agreeing poses."""
     where, neighbours = joined_once
     assert neighbours.manifest.by_id["other"].joint is None
     of_other = [one for one in neighbours.pair_results if "other" in (one.first, one.second)]
@@ -177,7 +177,7 @@ def test_a_room_of_the_same_plan_is_not_joined(joined_once: tuple[Path, TileJoin
 def test_answers_agree_through_the_joins_and_say_where_in_the_joint_world(
     joined_atlas: tuple[Path, Manifest],
 ):
-    """In the overlap two tiles know the place as well; as islands that is ambiguous."""
+    """In the overlap, both tiles localize the image. Without a join that is ambiguous."""
     where, _ = joined_atlas
     localizer = Localizer(Atlas.open(str(where)))
     for index in (5.5, 6.5, 8.5, 10.5):
@@ -201,8 +201,8 @@ def test_near_a_pose_reaches_tiles_that_are_joined(joined_atlas: tuple[Path, Man
 
 
 def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp_path: Path):
-    """A georeferenced map of the middle comes instead of the one before: its joins go, and are
-    found anew."""
+    """A georeferenced map replaces the middle tile. Its old joins are removed, and new
+    ones are found."""
     place, enu_from_room = (
         GeoPoint(50.87, 4.70, 30.0),
         Rigid3(exp_so3(np.array([0.0, 0.0, 0.5])), np.array([3.0, 2.0, 1.0])),
@@ -344,7 +344,7 @@ def test_info_names_worlds_and_joins(
 def test_pieces_of_one_recording_are_joined_by_the_pictures_that_both_have(
     parts: dict[str, Path], tmp_path: Path
 ):
-    """Each in a world of its own; maps of other pictures of the same walk have none in common."""
+    """Each piece has its own world frame. Maps of other images of the walk share no image."""
     recording = open_sequence(
         write_stereo_recording(tmp_path / "walk", indices=[float(k) for k in range(7)])
     )

@@ -1,5 +1,5 @@
-"""A walk of a single camera adjusted as a whole: what the map says of its first part tells how long
-the rest is."""
+"""Test the adjustment of a whole walk of a single camera: its mapped part fixes the
+scale of the rest."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def stretch() -> MonocularSubmap:
 
 
 def _too_long(by: float) -> dict[int, Rigid3]:
-    """The truth, but what lies beyond the known part is stretched."""
+    """Return the truth with the part beyond the mapped one stretched."""
     last = TRUTH[KNOWN[-1]].translation
     beyond = [
         Rigid3(pose.rotation, last + by * (pose.translation - last)) for pose in TRUTH[len(KNOWN) :]

@@ -1,4 +1,4 @@
-"""A walk drawn to what the map answers."""
+"""Test the correction of a trajectory towards poses in the map."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ ANSWERED = range(60)
 
 
 def _localized(pose: Rigid3, sigma_m: float = 0.03, sigma_deg: float = 1.0) -> Localization:
-    """`camera_covariance` is that of these sigmas."""
+    """Return a result whose `camera_covariance` has these sigmas."""
     of_camera = np.diag([sigma_m**2 / 3.0] * 3 + [np.radians(sigma_deg) ** 2 / 3.0] * 3)
     adjoint = pose.adjoint()
     return Localization(pose, adjoint @ of_camera @ adjoint.T, 0.99, 0, [], 100, 80)
 
 
 def _bent(by_m: float, by_deg: float) -> dict[int, Rigid3]:
-    """Off by so much at both ends, and right in the middle."""
+    """Return the truth with this error at both ends and none in the middle."""
     bend = np.cos(np.linspace(0.0, 2.0 * np.pi, len(TRUTH)))
     turns = [exp_so3(np.array([0.0, 0.0, np.radians(by_deg) * share])) for share in bend]
     return {
@@ -32,7 +32,7 @@ def _bent(by_m: float, by_deg: float) -> dict[int, Rigid3]:
 
 
 def _off(poses: dict[int, Rigid3]) -> np.ndarray:
-    """Metres and degrees from the truth, a row a frame."""
+    """Return metres and degrees from the truth, one row per frame."""
     apart = [poses[k].inverse() @ true for k, true in enumerate(TRUTH)]
     return np.array([(np.linalg.norm(one.translation), np.degrees(one.angle())) for one in apart])
 

@@ -1,5 +1,5 @@
-"""`topoloc update`: sessions that go on from what is mapped, that show it changed, that show
-nothing new, and those that do not fit."""
+"""Test `topoloc update`: sessions that extend a map, show changes, or show nothing new, and
+sessions that do not fit."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def map_file(first_half: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def second_half(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """From the mapped half into the other one, with poses in a world of its own."""
+    """Return a recording from the mapped half into the other one, with poses in its
+    own world frame."""
     folder = write_stereo_recording(tmp_path_factory.mktemp("second") / "on", indices=ON.tolist())
     return _in_another_world(folder)
 
@@ -129,8 +130,8 @@ def test_a_session_goes_on_from_what_is_mapped(
 
 
 def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, second_half: Path):
-    """As SLAM leaves them where it was lost between them; one that contradicts the map has no
-    poses, and takes no other with it."""
+    """SLAM leaves such stretches if it was lost between them. One that contradicts the map gets no
+    poses, and the others keep theirs."""
     sequence = open_sequence(second_half)
     cut, end = 12, 24
     moved = Rigid3(exp_so3(np.array([-0.5, 0.2, 0.4])), np.array([1.0, 2.0, -3.0]))
@@ -199,7 +200,7 @@ def test_a_session_that_shows_nothing_new_adds_counts_alone(map_file: Path, tmp_
 def test_a_changed_room_is_learnt_from_a_single_camera(
     map_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Two of the five surfaces look otherwise; the camera tells neither depth nor poses."""
+    """Two of the five surfaces look different. The camera has neither depth nor poses."""
     panels = room()
     for number in (0, 3):
         old = panels[number]
@@ -308,8 +309,8 @@ def test_the_same_session_is_not_doubled(
 
 
 def test_another_day_of_the_same_name_and_clock_is_another_session(map_file: Path, tmp_path: Path):
-    """Two recordings called `room`, with the same names of pictures and the same clock, of which
-    the second goes elsewhere."""
+    """Two recordings named `room` have equal image names and times, but the second
+    goes elsewhere."""
     other_day = write_stereo_recording(
         tmp_path / "day2" / "room", indices=[0.5 + k for k in range(7)]
     )

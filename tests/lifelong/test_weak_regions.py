@@ -1,4 +1,4 @@
-"""Which parts of a map are weakly held: by the map alone, and no node by itself."""
+"""Test the search for weak regions of a map: from the map alone, without the node itself."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TURNED = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
 
 @pytest.fixture(scope="module")
 def with_outpost(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The room, and one picture of another place ten metres off."""
+    """Return a map of the room and of one image of another place ten metres away."""
     folder = tmp_path_factory.mktemp("outpost")
     other = open_sequence(write_stereo_recording(folder / "other", seed=5, indices=[1.0]))
     far = SequenceView(other, [0], [Rigid3(np.eye(3), np.array([10.0, 0.0, 0.0]))])

@@ -1,4 +1,4 @@
-"""The colours of all points in view tell another floor of a building from this one."""
+"""Check that the colours of all visible points distinguish two floors of a building."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from topoloc.tracking.tracker_state import FloorEvidence
 
 @once_a_run
 def built_lab() -> TopoMetricMap:
-    """A map of every second frame of a part of the demo's lab, of SURF alone."""
+    """Return a map of every second frame of a part of the demo's lab, of SURF alone."""
     return build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@0:16:2"), BuildConfig(other_kinds=()))
 
 
@@ -56,7 +56,7 @@ def _unseen() -> list[StereoFrame]:
 
 
 def _painted(image: np.ndarray) -> np.ndarray:
-    """The image with other paint: the colours of each square are exchanged, brightness stays."""
+    """Return the image with the colours of each square exchanged and its brightness kept."""
     painted = image.copy()
     for number, (row, column) in enumerate(np.ndindex(6, 10)):
         cell = np.s_[row * 80 : row * 80 + 80, column * 80 : column * 80 + 80]

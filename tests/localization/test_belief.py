@@ -1,5 +1,5 @@
-"""What is believed of several hypotheses of one image, and what is answered: one posterior,
-whatever came first."""
+"""Test the belief over several hypotheses of one image and its result, which do not
+depend on the order."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hypothesis import given, strategies as st
 from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
 from msgspec import structs
 
+from topoloc.localization.answer import lead
 from topoloc.localization.belief import (
     Belief,
     Hypothesis,
@@ -22,18 +23,17 @@ from topoloc.localization.belief import (
 from topoloc.localization.config import EvidenceConfig, LocalizerConfig
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.result_decision import decide_result
 
 CONFIG = EvidenceConfig()
 POINTS = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3))
 
 
 def _answered(*hypotheses: Hypothesis) -> Localization | NotLocalized:
-    return decide_result(believed(list(hypotheses)))[0]
+    return lead(believed(list(hypotheses))).result
 
 
 def _along(result: Localization | NotLocalized) -> float:
-    """The metres along x of the pose that is answered."""
+    """Return x in metres of the reported pose."""
     assert isinstance(result, Localization)
     return float(result.world_from_cam.translation[0])
 
@@ -66,8 +66,7 @@ def test_poses_within_twice_what_is_tolerated_are_one():
 def test_poses_that_are_not_near_are_one_where_the_same_features_show_the_same_points(
     moved: float, expected: bool
 ):
-    """One of them is not precise yet; of two places that look alike, the same features show other
-    points."""
+    """One pose is not precise yet. At two similar places, the same features match other points."""
     features = made_features(len(POINTS))
     one = made_fit(0.0, POINTS, features)
     assert (
@@ -124,7 +123,7 @@ def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(
 @given(some_hypotheses)
 def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
     search = believed(hypotheses)
-    result, _ = decide_result(search)
+    result = lead(search).result
     if isinstance(result, Localization):
         assert search.best is not None
         assert result.world_from_cam == search.best.world_from_cam or np.array_equal(
@@ -163,7 +162,7 @@ def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(
 def test_poses_that_lead_from_one_to_the_next_are_told_apart_in_the_same_way_in_any_order(
     order: tuple[int, ...],
 ):
-    """The middle one says the same as both ends, which say different things."""
+    """The middle pose equals both ends, and the ends differ."""
     chain = [made_hypothesis(3.0, x=0.0), made_hypothesis(2.0, x=0.4), made_hypothesis(1.0, x=0.8)]
     belief = believed([chain[k] for k in order]).belief
     assert [one.log_odds for one in belief.ranked(WEIGHTS.rivals)] == [3.0, 1.0]
@@ -230,7 +229,7 @@ def test_what_is_found_evenly_tells_two_poses_apart_that_have_the_same_odds():
 def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(
     log_odds: float, other: float, is_answered: bool
 ):
-    """What a wrong place of the map has for it, a place that is not in the map may have as well."""
+    """A place outside of the map may have as much evidence as a wrong place in the map."""
     best, wrong = (
         made_hypothesis(log_odds, even_share=0.2),
         made_hypothesis(other, x=9.0, even_share=0.02),
@@ -261,15 +260,13 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
     search = believed(
         [made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)]
     )
-    assert isinstance(decide_result(search)[0], Localization)
+    assert isinstance(lead(search).result, Localization)
     strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
-    assert (
-        isinstance(decide_result(replace(search, weights=strict))[0], Localization) == is_answered
-    )
+    assert isinstance(lead(replace(search, weights=strict)).result, Localization) == is_answered
 
 
 def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
-    """Each of their points was held against all other walls."""
+    """Each of their points was compared with all other virtual views."""
     strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
     for walls in (True, False):
         search = believed(
@@ -278,7 +275,7 @@ def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
                 made_hypothesis(2.5 - WEIGHTS.rivals.lead - 0.1),
             ]
         )
-        assert isinstance(decide_result(replace(search, weights=strict))[0], Localization) == walls
+        assert isinstance(lead(replace(search, weights=strict)).result, Localization) == walls
 
 
 @pytest.mark.parametrize("doubt", [0.9, 1.5])
@@ -290,7 +287,7 @@ def test_an_unclear_pose_of_nodes_must_lead_walls_by_far_only_if_they_could_be_a
     search = believed(
         [made_hypothesis(2.5), made_hypothesis(behind, x=-9.0, walls=True, doubt=doubt)]
     )
-    result = decide_result(replace(search, weights=strict))[0]
+    result = lead(replace(search, weights=strict)).result
     assert isinstance(result, Localization) == (doubt > 1.0)
 
 
@@ -381,7 +378,7 @@ def test_a_search_that_was_cut_short_says_so():
     for hypotheses in ([], [made_hypothesis(-2.0)], [imprecise], alike):
         search = believed(hypotheses)
         search.is_stopped = True
-        result, _ = decide_result(search)
+        result = lead(search).result
         assert isinstance(result, NotLocalized)
         assert "time was up" in result.detail
 
@@ -389,7 +386,7 @@ def test_a_search_that_was_cut_short_says_so():
 def test_what_is_asked_of_an_answer_can_be_set():
     strict = LocalizerConfig(evidence=EvidenceConfig(min_probability=0.95))
     for log_odds, is_answer in ((2.0, False), (4.0, True)):
-        result, _ = decide_result(believed([made_hypothesis(log_odds)], strict))
+        result = lead(believed([made_hypothesis(log_odds)], strict)).result
         assert isinstance(result, Localization) is is_answer
 
 

@@ -1,5 +1,5 @@
-"""A map of two kinds of features is asked by the second where the first leaves the pose unclear,
-and only there."""
+"""Check that the second feature type of a map is used only if the first one leaves
+the pose unclear."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def topomap(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 @pytest.fixture
 def changed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Change], list[int]]:
-    """Changes what pictures give of a kind; the list grows with each picture that is asked for
-    them."""
+    """Return a function that changes the features of a type. It returns a list that grows with
+    each extraction."""
 
     def change(name: str, of: Change) -> list[int]:
         kind, asked = FEATURE_TYPES[name], list[int]()
@@ -68,7 +68,7 @@ def changed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Change], list[int
 
 
 def _useless(features: Features) -> Features:
-    """Each where another one was."""
+    """Return the features with shuffled positions."""
     shuffled = np.random.default_rng(0).permutation(len(features))
     return replace(features, points_img=features.points_img[shuffled])
 
@@ -98,7 +98,7 @@ def test_a_clear_picture_is_never_asked_for_the_second_kind(
 def test_where_another_place_is_nearly_as_likely_the_second_kind_is_asked(
     topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
 ):
-    """However clear the best one is: a twin of the place may be what the first kind is sure of."""
+    """Even a clear pose may be a similar place for the first feature type."""
     asked = changed("sift", lambda features: features)
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA)
@@ -114,7 +114,8 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
     monkeypatch: pytest.MonkeyPatch,
     says: float,
 ):
-    """A twin of the place is no less likely where a stream that was placed wrongly expects it."""
+    """A stream at a wrong place expects a similar place, so that the second feature type
+    must confirm it."""
     changed("sift", _useless)
     monkeypatch.setattr(
         "topoloc.localization.refine.cross_check_hypothesis",
@@ -132,8 +133,8 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
 def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
     topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, more: float, answers: str
 ):
-    """In other light the points of the first kind are found by chance, around any pose that is
-    nearly right."""
+    """In other light, the first feature type matches points by chance around any pose that
+    is nearly right."""
 
     def says(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | None]:
         said, of_last = cross_check_hypothesis(search, hypothesis)
@@ -153,7 +154,7 @@ def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
 def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_other_features(
     topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, kind: str, part: str
 ):
-    """They see too little to contradict it, and the pose is as wrong."""
+    """Other features have too few matches for a contradiction, and the pose is equally wrong."""
 
     def doubted(
         search: Search, fit: PoseFit
@@ -164,7 +165,7 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_other_features(
         is_doubted = search.query.feature_config.kind == kind
         return None if part == "distortion" else seen, doubt if is_doubted else None
 
-    monkeypatch.setattr("topoloc.localization.result_decision.check_image_calibration", doubted)
+    monkeypatch.setattr("topoloc.localization.checks.check_image_calibration", doubted)
     monkeypatch.setattr(Search, "is_settled", property(lambda search: kind == "surf"))
     result = Localizer(topomap).localize(PICTURE, CAMERA)
     assert isinstance(result, NotLocalized)
@@ -283,7 +284,8 @@ def test_a_stream_goes_through_a_map_of_two_kinds(
 def learned_map(
     tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str, tuple[str, ...]], TopoMetricMap]:
-    """A small map with features of a network that is not here any more."""
+    """Return a function that builds a small map with learned features, whose network is
+    missing afterwards."""
 
     def build(kind: str, others: tuple[str, ...]) -> TopoMetricMap:
         with monkeypatch.context() as patch:
@@ -322,8 +324,7 @@ def test_nothing_is_left_out_of_a_map_whose_kinds_are_here(topomap: TopoMetricMa
 
 
 def test_a_picture_is_out_of_memory_when_it_is_answered(topomap: TopoMetricMap):
-    """Not when the collector of rings comes by, which it does the more rarely the more a service
-    holds."""
+    """The memory is free without the garbage collector, which runs rarely in a large service."""
     localizer = Localizer(topomap)
     gc.collect()
     gc.disable()

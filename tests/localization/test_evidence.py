@@ -1,5 +1,5 @@
-"""The weighing of evidence: more of it is never less probable, and neither a count nor precision
-alone is enough."""
+"""Test the weights of evidence: more of it never lowers the odds, and neither a count nor precision
+alone suffices."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ evidences = st.builds(
 
 
 def _probability(evidence: Evidence, weights: FittedWeights) -> float:
-    """Of "here" against "nowhere"."""
+    """Return the probability of this pose against "nowhere in the map"."""
     return 1.0 / (1.0 + math.exp(-weights.log_odds(evidence)))
 
 
@@ -211,8 +211,8 @@ def test_only_a_pose_by_the_walls_is_asked_for_its_precision_beside_its_odds():
 
 @pytest.mark.parametrize("kind", ["surf", "topoloc-net"])
 def test_a_narrow_part_of_the_image_is_not_certain(kind: str):
-    """An image that shows a corridor the other way was taken for another of its doors at p .99: the
-    door alone has 82 points that are found, in 9 of 48 cells."""
+    """An image in reverse direction was localized at another door with p = .99. The door alone has
+    82 matched points, in 9 of 48 cells."""
     weights = load_fitted_weights(kind)
     door = replace(STRONG, num_matches=140, num_inliers=130, even_share=0.65, num_by_chance=0)
     assert _probability(replace(door, spread=0.35), weights) > 0.95

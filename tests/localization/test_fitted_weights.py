@@ -1,4 +1,5 @@
-"""Fitted weights are data: read strictly, and a kind without any says so."""
+"""Check that files of fitted weights are read strictly, and that a feature type without
+weights is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Guided matching on map points and key points made by hand."""
+"""Test guided matching with made map points and key points."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ NUM_POINTS = 200
 
 
 def _node(rng: np.random.Generator) -> TopoNode:
-    """A node at the origin of the world with points on a wall and beside it, each with a descriptor
-    of its own."""
+    """Return a node at the origin with points on a wall and beside it, each with its
+    own descriptor."""
     pixels = rng.uniform([40, 40], [600, 440], (NUM_POINTS, 2))
     depth = rng.uniform(2.0, 4.0, NUM_POINTS)
     points_cam = np.column_stack(
@@ -62,8 +62,7 @@ def _seen(
     turn: float = 0.0,
     scale: float = 1.0,
 ) -> Features:
-    """The node's points as a camera elsewhere sees them, a camera rolled by the rotation about its
-    axis."""
+    """Return the node's points as features of another camera, which is rolled about its axis."""
     points = cam_from_world.apply(node.points_cam.astype(np.float64))
     roll = np.arctan2(cam_from_world.rotation[1, 0], cam_from_world.rotation[0, 0])
     f = node.features
@@ -161,8 +160,8 @@ def test_a_kind_without_scale_and_angle_is_matched_however_large_and_turned():
 
 
 def test_a_lens_without_distortion_expects_points_where_one_with_next_to_none_does():
-    """The one is projected in a kernel, the other by the camera itself; some points lie behind the
-    camera, some beside the picture."""
+    """A kernel projects one camera, the camera model the other. Some points lie behind the camera
+    or outside of the image."""
     local_map = LocalMap.of_node(_node(np.random.default_rng(5)))
     lens = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 1e-15, 0.0))
     assert lens.is_distorted

@@ -1,4 +1,4 @@
-"""A wrong calibration is named, and paid for."""
+"""Check that a wrong calibration is named and lowers the odds."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -89,8 +89,7 @@ def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scal
 def test_another_camera_is_named_only_where_it_explains_the_picture_better(
     localizer: Localizer, queries: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """What a map is off by may ask for a camera that shows the points no nearer to where they must
-    be."""
+    """Errors of the map may favour a camera that moves the points no nearer to their pixels."""
     gains = list[float]()
 
     def gain(before: PoseFit, after: PoseFit) -> float:

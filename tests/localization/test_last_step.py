@@ -1,4 +1,4 @@
-"""The last step makes a reported pose more exact, and leaves it alone if it cannot."""
+"""Test the last step: it makes a reported pose more exact, or leaves it unchanged."""
 
 from __future__ import annotations
 
@@ -15,18 +15,16 @@ from scipy import ndimage
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.apps.report.explanation import explain, explanation_to_json
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization import schedule
 from topoloc.localization.exact import last_step, patch_alignment
-from topoloc.localization.exact.last_step import Surroundings, make_precise
+from topoloc.localization.exact.last_step import Surroundings
 from topoloc.localization.exact.patch_alignment import load_last_step_weights
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
-from topoloc.localization.result_decision import ResultWithInliers
-from topoloc.localization.search import Search, Trace
+from topoloc.localization.search import Trace
 from topoloc.mapping.mapping_frames import encode_small
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -79,23 +77,17 @@ def test_a_pose_that_cannot_be_aligned_keeps_the_shared_errors_of_its_first_one(
 
 
 def test_the_second_look_needs_matches_in_most_parts_of_the_view(
-    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+    room: TopoMetricMap,
 ):
     """A strip of the image, like a door of another place, is no evidence for the whole view."""
-    seen = list[list[Search]]()
-
-    def keep(searches: list[Search], outcome: ResultWithInliers, has_prior: bool):
-        seen.append(searches)
-        return make_precise(searches, outcome, has_prior)
-
-    monkeypatch.setattr(schedule, "make_precise", keep)
     image, truth = unseen_views(step=0.75)[0]
     strip = image.copy()
     strip[:, image.shape[1] // 2 :] = 128
     gains = list[float]()
     for shown in (image, strip):
-        Localizer(room).localize(shown, CAMERA)
-        around = Surroundings.of(seen[-1], truth.inverse(), load_last_step_weights())
+        context, query = Localizer(room).context, QueryImage(shown, CAMERA)
+        searches = context.searches(query, StageClock(), Deadline())
+        around = Surroundings.of(searches, truth.inverse(), load_last_step_weights())
         gains.append(around.compute_gain(truth.inverse()))
     assert gains[0] > 0.0
     assert gains[1] == 0.0

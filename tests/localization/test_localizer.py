@@ -1,4 +1,4 @@
-"""Localizing single pictures in a map of a rendered room, whose true poses are exact."""
+"""Localize single images in a map of a rendered room with exact true poses."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_a_map_without_nodes_cannot_be_asked(localizer: Localizer):
 
 
 class _FromBelow:
-    """A coarse localizer that knows nothing but the nodes' order, and was asked so often."""
+    """Rank nodes by their order alone, and count the queries."""
 
     num_asked = 0
 

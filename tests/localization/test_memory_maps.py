@@ -1,5 +1,5 @@
-"""A map of frames in memory, with and without poses; pictures and times of another kind are
-refused, not answered with "not here"."""
+"""Build maps of frames in memory, with and without poses. Invalid images and times raise an error
+instead of "not in the map"."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_single_pictures_without_poses_need_more(tiny_recording: Path):
 
 
 def test_pictures_and_times_of_another_kind_are_refused(room_map: Path):
-    """In a process of its own: here the tests' checks of shapes would speak first."""
+    """The calls run in another process, because the shape checks of the tests would raise first."""
     program = """
 import sys, numpy as np, topoloc
 localizer = topoloc.Localizer(topoloc.TopoMetricMap.load(sys.argv[1]))

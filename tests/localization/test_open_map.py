@@ -1,4 +1,4 @@
-"""Distances between views: as Eq. 1 for cameras held upright, and blind to which side is up."""
+"""Test distances between views: they equal Eq. 1 for upright cameras and ignore quarter turns."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The room seen by cameras that did not map it: other lenses, other sizes, rolled, and lenses that
-nobody has calibrated."""
+"""Localize the room with other cameras: other focal lengths and sizes, rolled, and uncalibrated."""
 
 from __future__ import annotations
 
@@ -12,9 +11,8 @@ from hypothesis import given, strategies as st
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA, path_pose, render, room
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.evidence import highest_probability
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -58,8 +56,8 @@ def test_other_lenses_and_other_sizes(factor: float, size: tuple[int, int], loca
 def test_a_camera_of_many_more_pixels_is_as_good_as_the_map_s_own(
     lens: str, localizer: Localizer, monkeypatch: pytest.MonkeyPatch
 ):
-    """Three times the pixels a radian: all that the map knows is too small to be found among them,
-    unless the picture is reduced."""
+    """With three times the pixels per radian, map points are too small to be matched unless the
+    image is reduced."""
     factor = 3
     camera = CAMERA.rescaled(factor * CAMERA.width, factor * CAMERA.height)
     known = {

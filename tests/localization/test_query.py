@@ -1,5 +1,4 @@
-"""Which query images are reduced before they are looked at, and how far; what is known of them
-when."""
+"""Test the reduction of query images, and the time at which their properties are computed."""
 
 from __future__ import annotations
 
@@ -8,8 +7,7 @@ import pytest
 
 from topoloc.errors import QueryError
 from topoloc.features.feature_types import FeatureConfig
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.localization.query import Deadline, Query, check_image_size, reduce_image
 
 MAP_FOCAL = 300.0

@@ -1,4 +1,4 @@
-"""The JSON of a query's result, key by key as the interface fixes it."""
+"""Test the JSON of a query's result key by key against the documented interface."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Results read back from JSON: what was written comes again, and what is no result is one error of
-ours."""
+"""Test results read back from JSON: they equal the written ones, and any other JSON raises
+one error type."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ SUSPECTED = replace(
 
 
 def rounded(value: Any) -> Any:
-    """A quaternion becomes a matrix and a quaternion again: the last digits may differ."""
+    """Round all numbers. The conversion of a quaternion to a matrix and back changes
+    the last digits."""
     if isinstance(value, dict):
         return {key: rounded(one) for key, one in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""The order of the proposals for one image, and when there are no more."""
+"""Test the order of the proposals for one image, and when they end."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from built_corridor import WIDE, corridor_of_two_kinds
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import MapError
-from topoloc.localization import schedule
+from topoloc.localization import map_query
 from topoloc.localization.fitted_weights import NodeStop
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_query import MapQuery, verify_all
 from topoloc.localization.proposals import propose
 from topoloc.localization.proposals.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import Deadline, QueryImage, StageClock
-from topoloc.localization.refine import find_best_case_evidence
+from topoloc.localization.refine import find_best_case
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.result_decision import ResultWithInliers
-from topoloc.localization.schedule import TileProposals, TileQuery
-from topoloc.localization.search import Search, Trace, verify
+from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
 
 FOREVER = Deadline()
@@ -41,28 +40,18 @@ def _searches(
     return localizer.context.searches(QueryImage(image, CAMERA), StageClock(), deadline)
 
 
-def _result(proposals: TileProposals) -> ResultWithInliers:
-    """Verify the proposals and return the result."""
-    while True:
-        try:
-            proposal = next(proposals)
-        except StopIteration as end:
-            return end.value
-        proposal.search.add(verify(proposal))
-
-
 def test_an_exhaustive_search_continues_from_the_coarse_one(
     localizer: Localizer, monkeypatch: pytest.MonkeyPatch
 ):
     image = unseen_views()[0][0]
     fast = Localizer(localizer.topomap, LocalizerConfig(exactness="fast"))
     at_once = fast.localize(image, CAMERA)
-    query = TileQuery(localizer.context, _searches(localizer, image))
+    query = MapQuery(localizer.context, _searches(localizer, image))
     num_matched, matcher = list[int](), propose.Matcher
     monkeypatch.setattr(propose, "Matcher", lambda *args: num_matched.append(1) or matcher(*args))
-    coarse, _ = _result(query.coarse_only())
+    coarse = query.search_first().result
     assert num_matched == [1]
-    result, _ = _result(query.exhaustive())
+    result = query.search_all().result
     assert num_matched == [1], "retrieval is not repeated"
     assert isinstance(coarse, Localization)
     assert isinstance(at_once, Localization)
@@ -73,8 +62,9 @@ def test_an_exhaustive_search_continues_from_the_coarse_one(
 
 def test_after_the_deadline_one_proposal_is_finished(localizer: Localizer):
     (search,) = searches = _searches(localizer, unseen_views(seed=1)[1][0], deadline=Deadline(0.0))
-    proposals = list(TileQuery(localizer.context, searches).exhaustive())
-    assert [one.source for one in proposals] == ["retrieval"]
+    search.trace = Trace()
+    MapQuery(localizer.context, searches).search_all()
+    assert [one.source for one in search.trace.tried] == ["retrieval"]
     assert search.is_stopped
 
 
@@ -88,12 +78,17 @@ def test_a_search_that_another_thread_stops_tries_no_further_proposal(localizer:
     assert len(stopped.tried) == 1
 
 
-def test_a_map_that_cannot_be_read_ends_the_search(localizer: Localizer):
+def test_a_map_that_cannot_be_read_ends_the_search(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch
+):
     searches = _searches(localizer, unseen_views()[0][0])
-    proposals = TileQuery(localizer.context, searches).exhaustive()
-    next(proposals).search.failure = MapError("cut off")
+
+    def cut_off(*_: object) -> None:
+        raise MapError("cut off")
+
+    monkeypatch.setattr(searches[0].map, "local_map", cut_off)
     with pytest.raises(MapError, match="cut off"):
-        next(proposals)
+        MapQuery(localizer.context, searches).search_all()
 
 
 def test_the_best_case_is_no_less_than_the_evidence_found(localizer: Localizer):
@@ -102,11 +97,11 @@ def test_the_best_case_is_no_less_than_the_evidence_found(localizer: Localizer):
         (search,) = _searches(localizer, image)
         quick = propose_quick(search, min_rival_inliers(search))
         assert quick is not None
-        best, result = find_best_case_evidence(quick), localizer.localize(image, CAMERA)
+        best, result = find_best_case(quick), localizer.localize(image, CAMERA)
         assert isinstance(result, Localization)
         assert best is not None
         assert result.evidence is not None
-        assert weights.log_odds(best) >= weights.log_odds(result.evidence)
+        assert best.log_odds >= weights.log_odds(result.evidence)
 
 
 def test_an_image_of_another_place_has_no_quick_proposal(localizer: Localizer):
@@ -122,7 +117,7 @@ def test_nodes_are_given_up_if_retrieval_finds_too_little(
     search.weights = replace(search.weights, stop=NodeStop(min_inliers))
     asked, match = list[int](), propose.match_predicted
     monkeypatch.setattr(propose, "match_predicted", lambda *a: asked.append(1) or match(*a))
-    result, _ = _result(TileQuery(localizer.context, [search]).exhaustive())
+    result = MapQuery(localizer.context, [search]).search_all().result
     assert isinstance(result, NotLocalized)
     assert search.num_retrieved < 20
     assert bool(asked) == (min_inliers == 0)
@@ -131,10 +126,9 @@ def test_nodes_are_given_up_if_retrieval_finds_too_little(
 def test_a_probable_pose_keeps_the_search_of_nodes_open(localizer: Localizer):
     (search,) = _searches(localizer, unseen_views()[0][0])
     search.weights = replace(search.weights, stop=NodeStop(10_000))
-    proposals = TileQuery(localizer.context, [search]).coarse_only()
-    first = next(proposals)
+    first = propose.propose_first(search, None)
     assert search.is_hopeless
-    search.add(verify(first))
+    verify_all(search, [first])
     assert search.best is not None
     assert search.best.probability > 0.5
     assert not search.is_hopeless
@@ -150,6 +144,6 @@ def test_earlier_feature_types_are_continued_unless_the_last_one_needs_none(
     first, last = searches
     last.weights = replace(last.weights, stop=NodeStop(continues_earlier=continues))
     asked = list[Search]()
-    monkeypatch.setattr(schedule, "propose_more", lambda one: asked.append(one) or [])
-    _result(TileQuery(localizer.context, searches).exhaustive())
+    monkeypatch.setattr(map_query, "propose_more", lambda one: asked.append(one) or [])
+    MapQuery(localizer.context, searches).search_all()
     assert asked == ([last, first] if continues else [last])

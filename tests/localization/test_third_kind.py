@@ -1,5 +1,5 @@
-"""A kind of features without scale and angle is added by one file (`corner_patches.py`) and one
-fit."""
+"""Check that one file (`corner_patches.py`) and one fit add a feature type without
+scale and angle."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Map files made to deceive: seeded changes at the level of SQL and of arrays, their checksums made
-right again or not."""
+"""Make malicious map files by seeded changes of SQL values and arrays, with or without
+right checksums."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ SCRIPTS = [
 
 
 def mutate(source: Path, target: Path, seed: int) -> str:
-    """Write a changed copy of a map; returns what was done. The same seed does the same."""
+    """Write a changed copy of a map and return a description of the change. Equal seeds make
+    equal changes."""
     rng = np.random.default_rng(seed)
     shutil.copyfile(source, target)
     if rng.random() < 0.1:
@@ -99,7 +100,7 @@ def mutate(source: Path, target: Path, seed: int) -> str:
 
 
 def forge(database: sqlite3.Connection) -> None:
-    """All checksums, counts and the digest as a careful deceiver would have them."""
+    """Set all checksums, counts and the digest to match the changed data."""
     database.text_factory = _text_of
     counts = {
         table: database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
@@ -142,7 +143,7 @@ def _flip(path: Path, rng: Rng) -> str:
 
 
 def _value(database: sqlite3.Connection, rng: Rng) -> str:
-    """Another value, of any type, in one column of one row or of all."""
+    """Set another value, of any type, in one column of one row or of all."""
     table, column = _column(rng, lambda name: True)
     value = _any_value(rng)
     where = (
@@ -171,7 +172,7 @@ def _resized(database: sqlite3.Connection, rng: Rng) -> str:
 
 
 def _floats(database: sqlite3.Connection, rng: Rng) -> str:
-    """A number within a blob: not finite, enormous, tiny or negative."""
+    """Set a number within a blob: not finite, huge, tiny or negative."""
     table, column = _column(rng, lambda declared: declared.startswith("BLOB"))
     row = database.execute(
         f"SELECT rowid, {column} FROM {table} ORDER BY random() LIMIT 1"
@@ -220,7 +221,7 @@ def _deleted(database: sqlite3.Connection, rng: Rng) -> str:
 
 
 def _agreed(database: sqlite3.Connection, rng: Rng) -> str:
-    """Sizes that agree with each other and with nothing else: of points, of descriptors."""
+    """Change sizes of points and descriptors together, so that they match only each other."""
     prefix = "side_" if rng.random() < 0.3 else ""
     size = int(rng.choice([0, 1, 2, 63, 65, 128]))
     is_one = rng.random() < 0.5
@@ -249,8 +250,7 @@ def _agreed(database: sqlite3.Connection, rng: Rng) -> str:
 
 
 def _arrays(database: sqlite3.Connection, rng: Rng) -> str:
-    """An array of a coarse localizer with another shape, type or content, in an archive that is as
-    it should be."""
+    """Change shape, type or content of a coarse localizer's array, in a valid archive."""
     table = "side_coarse_models" if rng.random() < 0.4 else "coarse_models"
     row = database.execute(f"SELECT rowid, arrays FROM {table} LIMIT 1").fetchone()
     if row is None or not isinstance(row[1], bytes):
@@ -287,7 +287,7 @@ def _arrays(database: sqlite3.Connection, rng: Rng) -> str:
 
 
 def _archive(database: sqlite3.Connection, rng: Rng) -> str:
-    """An archive or an array's header that lies about what it holds."""
+    """Write an archive or an array header that misstates its content."""
     headers = [
         "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000,)}",
         "{'descr': '|O', 'fortran_order': False, 'shape': (1,)}",
@@ -365,6 +365,6 @@ def _any_value(rng: Rng) -> int | float | str | bytes | None:
 
 
 def _try(database: sqlite3.Connection, statement: str, *values: object) -> None:
-    """Some changes the table's own constraints refuse."""
+    """Run a change. The table's own constraints refuse some."""
     with suppress(sqlite3.Error, OverflowError):
         database.execute(statement, values)

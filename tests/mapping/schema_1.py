@@ -1,5 +1,4 @@
-"""Maps as schema 1 kept them, written by plain SQL: what the versions before sessions and checksums
-left on people's disks."""
+"""Write maps of schema 1 in plain SQL, as versions before sessions and checksums did."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps as schema 2 kept them: the tables of today, the arrays of points as they are."""
+"""Write maps of schema 2: the current tables, with uncompressed arrays of points."""
 
 from __future__ import annotations
 

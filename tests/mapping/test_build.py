@@ -1,4 +1,4 @@
-"""Building a map: section III-A end to end on a rendered room."""
+"""Test map building (section III-A of the paper) end to end on a rendered room."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ ALONE = BuildConfig(nodes=NodeConfig(d_thresh=0.35, lambda_rot=1.0), other_kinds
 
 @pytest.fixture
 def own_recording(tiny_recording: Path, tmp_path: Path) -> Path:
-    """A copy of the recording that a test may spoil."""
+    """Return a copy of the recording that a test may damage."""
     return Path(shutil.copytree(tiny_recording, tmp_path / "own"))
 
 
 def depth_errors(node: TopoNode) -> np.ndarray:
-    """Measured less exact depth of a node's points, metres."""
+    """Return measured minus exact depth of a node's points, in metres."""
     _, depth = tiny_world.render(tiny_world.room(), node.summary.world_from_cam, node.camera)
     columns, rows = np.rint(node.features.points_img).astype(int).T
     return node.points_cam[:, 2] - depth[rows, columns]
@@ -106,8 +106,9 @@ def test_limits_on_points_are_kept(tiny_recording: Path, monkeypatch: pytest.Mon
 
 
 def test_points_of_a_lidar_are_as_exact_as_they_say(tmp_path: Path):
-    """Dots interpolated to an eighth of the image, with 1 % of noise: edges are smeared. Images
-    farther away decide, although the nearest three nodes of each are others."""
+    """Lidar dots are interpolated to an eighth of the image, with 1 % of noise and smeared
+    edges. Images farther away refine the points, although the nearest three nodes of each
+    image are others."""
     folder = tiny_world.write_depth_recording(tmp_path / "rgbd", indices=[*np.arange(0.0, 9.0)])
     for seed, file in enumerate(sorted((folder / "depth").iterdir())):
         depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float32)
@@ -191,7 +192,7 @@ def test_progress_is_told(tiny_recording: Path):
 
 
 class CountedReads:
-    """A recording that counts how often each frame is read."""
+    """Count the reads of each frame of a recording."""
 
     def __init__(self, base: topoloc.StereoSequence) -> None:
         self.name, self.names, self.t_ns, self.poses = base.name, base.names, base.t_ns, base.poses
@@ -212,7 +213,7 @@ def test_each_picture_is_read_once(tiny_recording: Path):
 
 
 class CountedHalves(CountedReads):
-    """One whose frames can be read without their right pictures, too; counts these reads apart."""
+    """Support reads of left images alone, and count them separately."""
 
     def __init__(self, base: topoloc.StereoSequence) -> None:
         super().__init__(base)

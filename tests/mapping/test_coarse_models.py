@@ -1,5 +1,5 @@
-"""Sessions by their light: which are of one, and that the coarse search makes less of what sets
-lights apart."""
+"""Test the grouping of sessions by light, and that the coarse search ignores
+differences of light."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from topoloc.mapping.coarse_models import (
     node_ids_to_rows,
     open_map_coarse_localizer,
 )
-from topoloc.mapping.sessions import Illumination, Session
+from topoloc.mapping.storage.entries import Illumination, Session
 from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
 from topoloc.retrieval.vlad import SurfVlad
@@ -57,8 +57,7 @@ def test_names_decide_where_there_are_some():
 def _model(
     rng: np.random.Generator, places: np.ndarray, shift: np.ndarray, covered: int
 ) -> SurfVlad:
-    """Places by day, and some of them once more by night; the vectors are what they are, whatever
-    the words."""
+    """Return places by day, some of them also by night. The vectors do not depend on the words."""
     vectors = np.concatenate([places, places[:covered] + shift]).astype(np.float32)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     p = vectors.shape[1]
@@ -74,7 +73,7 @@ def _model(
 
 
 def _asked(model: SurfVlad, vector: np.ndarray, words: np.ndarray) -> list[int]:
-    """What is ranked for a picture whose VLAD is this vector: one feature, and one word."""
+    """Return the ranking for an image with this VLAD vector, made of one feature and one word."""
     features = Features(
         points_img=np.zeros((1, 2), np.float32),
         sizes_px=np.ones(1, np.float32),

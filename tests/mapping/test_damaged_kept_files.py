@@ -18,7 +18,8 @@ from hypothesis import example, given, settings, strategies as st
 from mutations import forge
 
 from topoloc.errors import TopolocError
-from topoloc.mapping.edit import edit_map, find_kept_files, read_history, undo_edit
+from topoloc.mapping.edit import edit_map, read_history, undo_edit
+from topoloc.mapping.storage.kept_files import find_kept_files
 from topoloc.mapping.storage.schema import TABLES
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "aea690a" / "pruned.topo"
@@ -27,14 +28,15 @@ NUM_EDITS = 3
 
 @dataclass(frozen=True)
 class Sql:
-    """One statement on a table, with values. If `is_forged`, all checksums are right afterwards."""
+    """Run one statement on a table, with values. If `is_forged`, make all checksums
+    right afterwards."""
 
     statement: str
     values: tuple[object, ...]
     is_forged: bool
 
     def damage(self, path: Path) -> None:
-        """Run the statement on an SQLite file; a refused one changes nothing."""
+        """Run the statement on an SQLite file. A refused one changes nothing."""
         with (
             suppress(sqlite3.Error, OverflowError, TypeError, ValueError),
             closing(sqlite3.connect(path, isolation_level=None)) as database,
@@ -46,7 +48,7 @@ class Sql:
 
 @dataclass(frozen=True)
 class Bytes:
-    """Bytes in place of those from `start` to `end`, given as shares of the file."""
+    """Replace the bytes from `start` to `end`, given as shares of the file."""
 
     start: float
     end: float
@@ -61,12 +63,12 @@ class Bytes:
 
 @dataclass(frozen=True)
 class Node:
-    """Something else than a file of its own: nothing, a folder, a link to itself or to the map."""
+    """Replace a file by nothing, a folder, or a link to itself or to the map."""
 
     kind: str
 
     def damage(self, path: Path) -> None:
-        """Put it in place of a file."""
+        """Replace a file."""
         path.unlink()
         if self.kind == "folder":
             path.mkdir()
@@ -86,7 +88,7 @@ VALUES = st.one_of(
 
 @st.composite
 def sql(draw: st.DrawFn) -> Sql:
-    """A changed column of one row or of all, fewer rows, or another table."""
+    """Draw a statement that changes a column, deletes rows, or alters a table."""
     table = draw(st.sampled_from(list(TABLES)))
     column = draw(st.sampled_from([*TABLES[table], "checksum"]))
     row = draw(st.sampled_from(["", f" WHERE rowid = (SELECT max(rowid) FROM {table})"]))
@@ -136,7 +138,7 @@ COMMANDS = {"undo": _undo, "history": _history, "edit": _edit}
 
 @pytest.fixture(scope="module")
 def edited(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a map that was edited, and the files before its edits."""
+    """Return the folder of an edited map and its kept files."""
     path = Path(shutil.copy(FIXTURE, tmp_path_factory.mktemp("edited") / "map.topo"))
     for k in range(NUM_EDITS):
         with edit_map(path) as edit:
@@ -166,7 +168,7 @@ def test_a_command_succeeds_or_leaves_the_map_as_it_is(
 
 
 def _check(command: Callable[[Path], None], path: Path, name: str) -> None:
-    """Run a command on a map and look at the map afterwards."""
+    """Run a command on a map and check the map afterwards."""
     before = path.read_bytes()
     kept = {_short_digest(one): one.read_bytes() for one in _kept_regular_files(path)}
     error = None

@@ -1,4 +1,5 @@
-"""Edits of a map file: all or nothing, with a history, one at a time, taken back to the byte."""
+"""Test edits of a map file: all or nothing, with a history, one at a time, and
+byte-identical after undo."""
 
 from __future__ import annotations
 
@@ -18,14 +19,12 @@ from schema_1 import write_schema_1
 from topoloc import TopoMetricMap
 from topoloc.errors import MapError
 from topoloc.mapping.edit import (
-    _digest_of as of,
     edit_map,
-    find_kept_files,
-    keep_file,
     read_history,
     undo_edit,
 )
 from topoloc.mapping.storage.integrity_check import find_map_damage
+from topoloc.mapping.storage.kept_files import _digest_of as of, find_kept_files, keep_file
 
 
 @pytest.fixture
@@ -38,7 +37,7 @@ def _names(path: Path) -> list[str]:
 
 
 def _without_a_node(path: Path, changes: dict | None = None) -> None:
-    """A node with all that is of it goes, another one's template changes."""
+    """Remove a node and its data, and change the template of another."""
     with edit_map(path) as edit:
         topomap, gone = edit.topomap, edit.topomap.summaries[-1].node_id
         first, *rest = list(topomap.nodes)[:-1]
@@ -100,7 +99,7 @@ def test_without_hard_links_the_file_is_copied(map_file: Path, monkeypatch: pyte
 
 def test_the_oldest_files_go_beyond_the_limit(map_file: Path, monkeypatch: pytest.MonkeyPatch):
     for limit, num_kept in ((2.5 * map_file.stat().st_size, 2), (1, 1)):
-        monkeypatch.setattr("topoloc.mapping.edit._MAX_BYTES", limit)
+        monkeypatch.setattr("topoloc.mapping.storage.kept_files._MAX_BYTES", limit)
         for k in range(3):
             with edit_map(map_file) as edit:
                 edit.commit(edit.topomap, f"edit {k}")
@@ -167,13 +166,15 @@ def test_a_damaged_kept_file_is_refused(map_file: Path, seed: int):
 
 
 def test_an_edit_reads_one_of_the_older_kept_files(map_file: Path, monkeypatch: pytest.MonkeyPatch):
-    """All together may have 1 GB. `history` reads all; `undo` reads the one that it restores."""
+    """All kept files together may have 1 GB. `history` reads all of them, and `undo` reads only
+    the restored one."""
     for _ in range(4):
         _without_a_node(map_file)
     kept, read = find_kept_files(map_file), list[Path]()
     kept[2].write_bytes(kept[2].read_bytes()[:-1])
     with monkeypatch.context() as patched:
-        patched.setattr("topoloc.mapping.edit._digest_of", lambda one: read.append(one) or of(one))
+        digests = "topoloc.mapping.storage.kept_files._digest_of"
+        patched.setattr(digests, lambda one: read.append(one) or of(one))
         _without_a_node(map_file)
     assert [one for one in read if one in kept] == [kept[0]]
     with pytest.warns(UserWarning, match=f"{kept[2].name} is damaged"):

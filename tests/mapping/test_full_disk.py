@@ -1,4 +1,5 @@
-"""On a full disk, or with few file handles, an edit or undo is done or changes nothing."""
+"""Check that an edit or undo is complete or changes nothing on a full disk or with
+few file handles."""
 
 from __future__ import annotations
 
@@ -63,7 +64,7 @@ for kb in range(*map(int, sys.argv[3:])):
 
 @pytest.fixture
 def edited(room_map: Path, tmp_path: Path) -> Path:
-    """A map with two kept files, alone in its folder."""
+    """Return a map with two kept files, alone in its folder."""
     (tmp_path / "maps").mkdir()
     path = Path(shutil.copy(room_map, tmp_path / "maps" / "room.topo"))
     for name in ("first", "second"):
@@ -176,7 +177,7 @@ def test_a_full_folder_of_temporary_files_is_named(edited: Path, monkeypatch: py
 
 
 def _fill(self: map_writing._Writer, _: TopoMetricMap) -> None:
-    """Meet the limit of a small temporary database."""
+    """Reach the size limit of a small temporary database."""
     self._database.execute("CREATE TABLE t (a BLOB)")
     self._database.execute("PRAGMA max_page_count = 3")
     self._database.execute("INSERT INTO t VALUES (zeroblob(100000))")

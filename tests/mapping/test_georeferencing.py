@@ -1,5 +1,5 @@
-"""Where on earth a map lies: found where the points say it, refused in one line where they do
-not."""
+"""Test the georeference of a map: estimated if the points determine it, else
+refused in one line."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def places_of(
 
 
 def off(found: Georeference, true: Georeference = TRUE) -> tuple[float, float]:
-    """Largest distance of a point of the walk from where it is (metres), and the angle between the
-    two worlds (degrees)."""
+    """Return the largest error of a point of the walk (metres) and the angle between the two
+    worlds (degrees)."""
     away = max(
         float(np.linalg.norm(found.geopoint(point).ecef() - true.geopoint(point).ecef()))
         for point in WALK

@@ -1,4 +1,4 @@
-"""`topoloc info --check`: every byte counts, and nodes that were moved together are found."""
+"""Test `topoloc info --check`: it checks each byte and finds nodes that were moved together."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The sums of sessions: positions and covariances follow from them, and what a session brought can
-be taken away again."""
+"""Test the sums of sessions: they give positions and covariances, and one session can
+be subtracted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """The sums of all points of a node over some sessions; -1 stands for no session."""
+    """Hold the sums of all points of a node over some sessions. The value -1 means no session."""
 
     information: np.ndarray
     pulls: np.ndarray
@@ -34,8 +34,8 @@ class Sums:
 
     @staticmethod
     def of(statistics: Sequence[LandmarkStatistics], num_points: int) -> Sums:
-        """Add up the statistics, as the file's page describes them (A = L L', g = L times the
-        pulls)."""
+        """Add up the statistics as the documentation of the file defines them (A = L L', g = L
+        times the pulls)."""
         information, pulls = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
         expected, seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
         first, last = np.full(num_points, -1), np.full(num_points, -1)
@@ -52,7 +52,7 @@ class Sums:
         return Sums(information, pulls, expected, seen, first, last)
 
     def solve(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The positions and covariances by these sums, of points stored at `points_cam`."""
+        """Return positions and covariances from these sums, for points stored at `points_cam`."""
         covariances = np.linalg.inv(self.information)
         return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
 
@@ -91,8 +91,8 @@ def test_the_sums_cost_little(saved: Path):
 
 
 def test_a_session_can_be_taken_away_again():
-    """Points measured by one session and seen again by another: without its sums they are where
-    they were before it."""
+    """Points of one session were observed by another. Without its sums they return to their
+    old positions."""
     rng = np.random.default_rng(0)
     truth = np.column_stack([rng.uniform(-1.0, 1.0, (40, 2)), rng.uniform(2.0, 4.0, 40)])
     covariances = np.tile(np.diag([1e-4, 1e-4, 1e-2]), (40, 1, 1))
@@ -154,8 +154,7 @@ def _counts(session_id: int, rows: list[int], expected: int, seen: list[int]) ->
 
 
 def test_sessions_that_only_counted_take_the_room_of_two():
-    """Those of another light, which saw next to nothing again, stay apart from those that saw the
-    rest."""
+    """Sessions in other light, with few observations, stay separate from sessions with many."""
     own = LandmarkStatistics.of(
         0,
         np.arange(3),

@@ -1,5 +1,5 @@
-"""Points refined by what other images see of them: errors shrink, covariances stay honest,
-contradictions are found."""
+"""Test points refined by observations of other images: errors shrink, covariances stay right,
+outliers are found."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SIGMA_PX = 0.8
 
 @dataclass
 class Scene:
-    """Points as they are and as one stereo pair measured them, and eight views of them from up to a
-    metre away."""
+    """Hold true points, their measurement by one stereo pair, and eight views of them from up
+    to a metre away."""
 
     truth: np.ndarray
     measured: np.ndarray
@@ -51,7 +51,7 @@ def scene(num_points: int = 400, seed: int = 0) -> Scene:
 
 
 def view(points: np.ndarray, cam_from_node: Rigid3, rng: np.random.Generator) -> Observations:
-    """Seven of ten points, where they are imaged, with noise."""
+    """Return noisy observations of seven of ten points."""
     rows = np.flatnonzero(rng.random(len(points)) < 0.7)
     seen = cam_from_node.apply(points[rows])
     normalized = seen[:, :2] / seen[:, 2:] + rng.normal(0, SIGMA_PX / 500.0, (len(rows), 2))
@@ -108,7 +108,7 @@ def test_without_observations_everything_stays_as_measured():
 
 
 def features_at(points_img: np.ndarray, seed: int = 3) -> Features:
-    """One descriptor of its own a point; the same seed gives the same ones."""
+    """Return features with a different descriptor per point. Equal seeds give equal descriptors."""
     num = len(points_img)
     descriptors = np.random.default_rng(seed).standard_normal((num, 64)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
@@ -117,7 +117,8 @@ def features_at(points_img: np.ndarray, seed: int = 3) -> Features:
 
 
 def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
-    """What another image sees of the scene's points whose key points are displaced by this."""
+    """Return another image's observations of the scene's points, with this offset of
+    the key points."""
     s, cam_from_node = (
         scene(60),
         Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), np.array([0.3, 0.0, 0.1])),

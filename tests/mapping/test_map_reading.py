@@ -1,4 +1,4 @@
-"""An open map file: read entry by entry, and damage inside it is told in one line."""
+"""Test an open map file: it is read entry by entry, and damage inside it is one line."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ print(asked)
 
 
 def test_opening_reads_no_node(saved: Path):
-    """In a process of its own, since checking the types of a map's entries reads them."""
+    """It runs in another process, because the shape checks of the tests read the
+    entries of a map."""
     answer = subprocess.run(
         [sys.executable, "-c", QUERIES_OF_OPENING, str(saved)],
         capture_output=True,
@@ -121,7 +122,7 @@ def test_damage_inside_is_a_map_error_of_one_line(saved: Path, change: str):
 
 
 def test_overwritten_pages_are_a_map_error_or_do_no_harm(saved: Path):
-    """Structure that SQLite finds broken, at any depth, must not come out as another exception."""
+    """A structure that SQLite finds broken, at any depth, must not raise another exception."""
     size, rng, found = saved.stat().st_size, np.random.default_rng(0), 0
     content = saved.read_bytes()
     for page in range(1, size // 16384):

@@ -1,5 +1,4 @@
-"""The map file: what goes in comes out, whole or not at all, and a broken one is told from a good
-one."""
+"""Test the map file: its content is read back, it is complete or absent, and damage is detected."""
 
 from __future__ import annotations
 
@@ -141,7 +140,7 @@ def test_a_failed_write_leaves_the_old_map_and_nothing_else(
 def test_a_disk_that_is_full_is_a_map_error(
     tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """SQLite's own error: the file may not grow beyond a few pages."""
+    """SQLite raises its own error, because the file is limited to a few pages."""
 
     def small(*args, **kwargs) -> sqlite3.Connection:
         database = real(*args, **kwargs)

@@ -1,4 +1,5 @@
-"""Maps of older schemas open, answer as they always did, and are saved as those of today."""
+"""Check that maps of older schemas open, give the same results, and are saved in the
+current schema."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from built_corridor import WIDE, built_corridor, seen_ahead
 from topoloc.errors import MapError
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.sessions import Session
+from topoloc.mapping.storage.entries import Session
 from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 

@@ -1,4 +1,4 @@
-"""One budget of bytes for the nodes of all open maps."""
+"""Test the byte budget that the nodes of all open maps share."""
 
 from __future__ import annotations
 

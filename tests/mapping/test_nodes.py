@@ -1,4 +1,4 @@
-"""Where nodes are placed: Eq. 1 and its two parameters."""
+"""Test the selection of nodes by Eq. 1 and its two parameters."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""A power cut at any moment of an edit or undo leaves the map before or after it.
+"""Check that a power cut at any moment of an edit or undo leaves the map before or after it.
 
-The file operations are recorded. Then the disk is built as a crash after each of them may leave it:
-the content of a file is what was last synchronized, and changes of names since the last
-synchronization of the folder are lost, all of them or some.
+The file operations are recorded. Then each possible state of the disk after a crash is made. A file
+has its last synchronized content. Of the name changes since the last synchronization of the folder,
+all or some are lost.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from typing import Any
 import pytest
 
 from topoloc.errors import MapError
-from topoloc.mapping.edit import edit_map, find_kept_files, undo_edit
+from topoloc.mapping.edit import edit_map, undo_edit
 from topoloc.mapping.storage.integrity_check import find_map_damage
+from topoloc.mapping.storage.kept_files import find_kept_files
 
 
 @dataclass
 class Disk:
-    """What is safe on the disk: `names` to inodes, and the content of inodes. `pending` are changes
-    of names that are not."""
+    """Hold the synchronized state of the disk: `names` to inodes, and the content of inodes.
+    `pending` are name changes that are not synchronized."""
 
     names: dict[str, int]
     contents: dict[int, bytes]
@@ -54,7 +55,7 @@ def _apply(names: dict[str, int], change: str, source: str, target: str, inode: 
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch, room_map: Path, tmp_path: Path) -> Disk:
-    """A folder with one map, whose file operations are recorded from now on."""
+    """Return a folder with one map. Its file operations are recorded from now on."""
     folder = tmp_path / "maps"
     folder.mkdir()
     path = Path(shutil.copy(room_map, folder / "room.topo"))

@@ -1,4 +1,4 @@
-"""Texts of a map file reach the terminal with escapes, and settings of any JSON in one line."""
+"""Check that texts of a map file are printed with escapes, and settings of any JSON in one line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TITLE = "\x1b]0;owned\x07\nerror: forged"
 
 
 def _changed(room_map: Path, tmp_path: Path, statement: str, *values: str) -> Path:
-    """A copy of a map with other texts, all checksums right."""
+    """Return a copy of a map with other texts and right checksums."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     with closing(sqlite3.connect(path, isolation_level=None)) as database:
         database.execute(statement, values)

@@ -1,5 +1,5 @@
-"""A map of several kinds of features: what goes in comes out, and it can be taken for a map of each
-of them."""
+"""Test a map of several feature types: its content is read back, and each type can
+be used alone."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.storage.integrity_check import find_map_damage, list_coarse_models
+from topoloc.mapping.storage.integrity_check import find_map_damage
+from topoloc.mapping.storage.map_reading import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
-from topoloc.retrieval.cell_grid import CellGrid
+from topoloc.retrieval.vlad import CellGrid
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,5 @@
-"""Ids are not rows: maps whose middle was removed, two sessions of one name, maps that are closed,
-pickled and replaced."""
+"""Test ids and rows: maps with removed nodes, two sessions of one name, and closed, pickled or
+replaced maps."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from topoloc_training.coarse_training import in_ids
 
 
 def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMetricMap:
-    """The map with its nodes called `ids`, and then all but the rows `kept` removed; the coarse
-    localizers still know those."""
+    """Return the map with the node ids `ids` and only the rows `kept`. The coarse localizers still
+    contain all nodes."""
     of = dict(zip([summary.node_id for summary in topomap.summaries], ids, strict=True))
     nodes = [topomap.nodes[row] for row in kept]
     nodes = [
@@ -67,7 +67,7 @@ def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMet
 
 @pytest.fixture(scope="module")
 def renumbered(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The corridor with other ids, three nodes in its middle removed; saved."""
+    """Save a map of the corridor with other ids and three middle nodes removed."""
     topomap = built_corridor()
     num, path = len(topomap.nodes), tmp_path_factory.mktemp("ids") / "corridor.topo"
     kept = [row for row in range(num) if not num // 2 - 1 <= row <= num // 2 + 1]

@@ -1,5 +1,5 @@
-"""Side nodes: the points of the walls as cameras turned to them would know them, and their place in
-the map file."""
+"""Test nodes of virtual views: wall points as cameras turned to them would measure them, and
+their map tables."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.config import VirtualNodesConfig
-from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
-from topoloc.mapping.topomap import NodeSummary, TopoMetricMap, TopoNode, VirtualNodes
-from topoloc.mapping.virtual_nodes import (
+from topoloc.mapping.node_drafts import (
     collect_virtual_nodes,
     create_virtual_nodes,
     select_virtual_view_nodes,
 )
+from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
+from topoloc.mapping.topomap import NodeSummary, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.retrieval.vlad import SurfVlad
 
@@ -52,7 +52,8 @@ def described(view: PreparedFrame, **limits: int) -> list[TopoNode]:
 
 
 def depth_errors(node: TopoNode) -> np.ndarray:
-    """Measured less exact depth of the points along the side camera's axis, metres."""
+    """Return measured minus exact depth of the points along the virtual camera's
+    axis, in metres."""
     _, depth = render(corridor(), node.summary.world_from_cam, node.camera)
     columns, rows = np.rint(node.features.points_img).astype(int).T
     return node.points_cam[:, 2] - depth[rows, columns]
@@ -168,7 +169,7 @@ def test_without_spacing_a_map_has_none(tiny_recording: Path):
 def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
     steps: list[tuple[float, float]], spacing: float
 ):
-    """By Eq. 1 with a larger threshold and turns that count half."""
+    """The distance is Eq. 1 with a larger threshold and half the weight of rotations."""
     ways, turns = np.cumsum(np.array(steps), axis=0).T
     poses = [
         Rigid3(exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, way]))
@@ -271,7 +272,8 @@ print(asked)
 
 
 def test_opening_reads_no_side_node(saved_corridor: Path):
-    """In a process of its own, since checking the types of a map's entries reads them."""
+    """It runs in another process, because the shape checks of the tests read the
+    entries of a map."""
     answer = subprocess.run(
         [sys.executable, "-c", QUERIES_OF_OPENING, str(saved_corridor)],
         capture_output=True,

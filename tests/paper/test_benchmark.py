@@ -1,5 +1,5 @@
-"""`topoloc benchmark` on the tiny room: all of its parts, the page, and going on from what is
-there."""
+"""Test `topoloc benchmark` on the tiny room: all parts, the page, and a second run on
+stored results."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from topoloc_paper.settings import PaperConfig, WeightFiles
 
 @pytest.fixture
 def room(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The quick run asks the tiny room in the place of the lab, and trains for one epoch; returns
-    --out."""
+    """Replace the lab of the quick run by the tiny room, train for one epoch, and return --out."""
     queries = {
         "day": str(write_pictures(tmp_path / "day", unseen_views()[:4])),
         "night": str(write_pictures(tmp_path / "night", unseen_views()[:2])),

@@ -1,4 +1,4 @@
-"""`topoloc benchmark paper --quick` as a user types it, on the lab that topoloc brings along."""
+"""Test `topoloc benchmark paper --quick` as a user types it, on the shipped lab."""
 
 from __future__ import annotations
 

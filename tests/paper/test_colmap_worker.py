@@ -1,4 +1,4 @@
-"""The matching that pycolmap's peer does outside of pycolmap."""
+"""Test the matching that the pycolmap peer computes outside of pycolmap."""
 
 from __future__ import annotations
 

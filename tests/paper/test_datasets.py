@@ -1,4 +1,5 @@
-"""The benchmark's places: the words that render them, and which recordings count as being there."""
+"""Test the datasets of the benchmark: the commands that render them, and which
+recordings are complete."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ def test_simulate_with_the_same_words_has_the_same_settings(recording: PaperReco
 
 
 def _begun(folder: Path, draft: bool) -> Layout:
-    """Everything of TINY but its pictures, as the recorder begins it."""
+    """Write all files of TINY except its images, as the recorder does at the start."""
     pytest.importorskip("mitsuba", reason="the recorder stores Mitsuba's version")
     world, config = find_world(TINY.world), TINY.config(draft)
     route = plan_route(world.loop, world.camera_height, config.route)

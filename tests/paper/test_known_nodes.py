@@ -1,4 +1,4 @@
-"""The true nearest nodes in place of the coarse localizer's ranking."""
+"""Test queries with the true nearest nodes in place of the coarse localizer's ranking."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from topoloc_paper.known_nodes import KnownNodes, answer_with_known_nodes
 
 @pytest.fixture(scope="module")
 def lab() -> TopoMetricMap:
-    """A lap of the lab, with SURF and the learned features."""
+    """Return the map of one lap of the lab, with SURF and the learned features."""
     config = BuildConfig(nodes=NodeConfig(2.0, 2.0))
     return build_map(open_sequence(SHIPPED / "map_lap1"), config)
 

@@ -1,4 +1,4 @@
-"""The functions that stand in for torchvision's, and what is said where the package is missing."""
+"""Test the functions that replace torchvision's, and the error without the package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from topoloc_paper.lightglue import NEEDED_FILES, WHEEL, check, deform_conv2d
 
 
 def _sample(image: np.ndarray, y: float, x: float) -> np.ndarray:
-    """All channels at one place, bilinear, zero beyond the border."""
+    """Return all channels at one place: bilinear, and zero beyond the border."""
     value = np.zeros(len(image))
     for row in (int(np.floor(y)), int(np.floor(y)) + 1):
         for column in (int(np.floor(x)), int(np.floor(x)) + 1):

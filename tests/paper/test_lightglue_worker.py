@@ -1,4 +1,4 @@
-"""Triangulation and pose of the worker, with key points and matches that are known exactly."""
+"""Test triangulation and pose of the worker with known key points and matches."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The peers on the tiny room: each finds itself there, each fails where it must, and sizes are what
-lies on the disk."""
+"""Test the peers on the tiny room: right poses, expected failures, and sizes on disk."""
 
 from __future__ import annotations
 

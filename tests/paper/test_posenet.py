@@ -1,5 +1,4 @@
-"""PoseNet: its losses against what they say they are, and a network that learns the rendered
-room."""
+"""Test PoseNet: its losses against their formulas, and a network that learns the rendered room."""
 
 from __future__ import annotations
 

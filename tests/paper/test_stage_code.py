@@ -1,5 +1,5 @@
-"""What a stage is done again for: a change of code that its result follows from, and of no
-other."""
+"""Check that a stage runs again after a change of code that its result depends on, and of
+no other code."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ASKING, PEERS = {"asking surf-vlad", "asking cnn-nn"}, set(_CODE)
 
 @pytest.fixture
 def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the program that may be changed."""
+    """Return a copy of the program that a test may change."""
     for package, root in ROOTS.items():
         shutil.copytree(
             root / package,
@@ -59,12 +59,12 @@ _READ = {"_imports": stage_code._imports.__wrapped__, "_meaning": stage_code._me
 
 @functools.cache
 def _of_content(reading: str, module: str, content: bytes) -> object:
-    """What is read of a module, once for all tests that leave it as it is."""
+    """Return the reading of a module, cached for all tests that leave it unchanged."""
     return _READ[reading](module)
 
 
 def _forget() -> None:
-    """Each file is read again; but the trees of those that are as before."""
+    """Read each file again, but keep the trees of unchanged files."""
     for reading in _READ:
 
         @functools.cache
@@ -75,7 +75,7 @@ def _forget() -> None:
 
 
 def _done_again(change: Callable[[], object]) -> set[str]:
-    """The stages whose code is another after the change."""
+    """Return the stages whose code differs after the change."""
     before = {name: stage.digest() for name, stage in STAGES.items()}
     change()
     _forget()

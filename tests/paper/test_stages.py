@@ -1,4 +1,4 @@
-"""Kept stages: found again while nothing changed, done again where something did or was lost."""
+"""Test stored stages: reused without a change, and computed again after a change or a loss."""
 
 from __future__ import annotations
 

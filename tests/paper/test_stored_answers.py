@@ -1,4 +1,4 @@
-"""Answers survive their way through JSON."""
+"""Check that results survive a round trip through JSON."""
 
 from __future__ import annotations
 

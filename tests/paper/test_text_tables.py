@@ -1,5 +1,5 @@
-"""The block in docs/journal/paper.md is what the stored results give; tables say what was not run,
-and hide no query."""
+"""Check that the tables in docs/journal/paper.md match the stored results, name skipped runs, and
+count each query."""
 
 from __future__ import annotations
 

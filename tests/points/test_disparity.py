@@ -1,4 +1,4 @@
-"""Disparities of the rendered room against its exact depth."""
+"""Compare disparities of the rendered room with its exact depth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 import tiny_world
 from room_frames import depth_frame, stereo_frame
-from topoloc.points.disparity import measure_disparities, measured_view
+from topoloc.points.metric_points import measure_disparities, measured_view
 from topoloc.points.point_tracking import find_corners
 
 BF = tiny_world.CAMERA.fx * tiny_world.BASELINE

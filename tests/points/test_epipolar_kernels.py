@@ -1,4 +1,4 @@
-"""Disparities of single points: on textures known as formulas, so that the truth is exact to any
+"""Test disparities of single points on textures given by formulas, with exact truth at any
 fraction of a pixel."""
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ WIDTH, HEIGHT = 320, 200
 
 
 class Waves:
-    """A texture that can be asked anywhere: sixty waves of random direction, from 6 to 40 pixels
-    long."""
+    """Define a texture at any coordinates: sixty waves of random direction, 6 to 40 pixels long."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -35,8 +34,8 @@ class Waves:
 def rendered_pair(
     offset: float, along: float, down: float, noise: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right picture of a plane of disparity offset + along * x + down * y (left pixels),
-    in whole grey levels."""
+    """Return left and right image of a plane of disparity offset + along * x + down * y (left
+    pixels), in integer grey levels."""
     texture, rng = Waves(seed), np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
     left, right = texture.at(x, y), texture.at((x + offset + down * y) / (1.0 - along), y)
@@ -106,7 +105,7 @@ def test_disparity_is_unbiased_and_as_precise_as_it_says(plane: tuple[float, flo
 
 
 def test_no_fraction_of_a_pixel_is_preferred():
-    """The error must not follow the disparity's fraction, as that of a parabola through
+    """The error must not depend on the disparity's fraction, as the error of a parabola through
     correlations does."""
     errors = []
     for fraction in np.arange(0.0, 1.0, 0.125):

@@ -1,4 +1,5 @@
-"""3-D positions of features, from stereo and from depth, against a rendered room's truth."""
+"""Test 3-D positions of features, from stereo and from depth, against the truth of a
+rendered room."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from topoloc.recordings.frame_preparation import PreparedFrame
 
 @pytest.fixture(scope="module")
 def room_view() -> tuple[PreparedFrame, np.ndarray]:
-    """Left and right picture of the room, and the exact depth."""
+    """Return left and right image of the room, and the exact depth."""
     panels, pose = tiny_world.room(), tiny_world.path_pose(4)
     (left, depth), (right, _) = (
         tiny_world.render(panels, p, noise_seed=k)

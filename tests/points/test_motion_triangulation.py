@@ -1,4 +1,4 @@
-"""3-D positions of a single picture's features from others under known poses: made points with
+"""Test 3-D positions of an image's features from other images with known poses: made points with
 known noise, and the rendered room."""
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _features(points_img: np.ndarray, descriptors: np.ndarray) -> Features:
 
 
 def _made(num: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points before the camera in the origin (metres), and a descriptor of each."""
+    """Return points in front of a camera at the origin (metres), and a descriptor of each."""
     rng = np.random.default_rng(seed)
     points = np.column_stack(
         [rng.uniform(-1.0, 1.6, num), rng.uniform(-0.8, 0.8, num), rng.uniform(2.5, 6.0, num)]
@@ -48,8 +48,7 @@ def _located(
     order: list[np.ndarray] | None = None,
     poses: list[Rigid3] = POSES,
 ) -> MetricPoints:
-    """What is located of these points; `order` says which descriptor each point shows to each other
-    picture."""
+    """Return the triangulated points. `order` assigns descriptors to points in each other image."""
     rng = np.random.default_rng(7)
     sigmas = np.full(len(points), SIGMA_PX)
     own = _features(
@@ -134,7 +133,7 @@ def test_points_of_the_rendered_room():
 
 
 class TestChoice:
-    """Which pictures locate the points of another."""
+    """Test the selection of images that triangulate the points of another."""
 
     LINE = tuple(Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(40))
 

@@ -1,4 +1,4 @@
-"""Corners, and points followed through shifts, growth and changes of light."""
+"""Test corners, and points tracked through shifts, scaling and changes of light."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def picture() -> np.ndarray:
 
 
 def warped(picture: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """The picture moved by SHIFT, and enlarged about its middle."""
+    """Return the image shifted by SHIFT and scaled about its middle."""
     middle = (np.array(picture.shape[::-1]) - 1) / 2
     offset = middle - scale * middle + SHIFT
     matrix = np.array([[scale, 0.0, offset[0]], [0.0, scale, offset[1]]])

@@ -1,4 +1,4 @@
-"""Files are whole or not there, whoever writes at the same time and however a writer ends."""
+"""Check that files are complete or absent with parallel writers, and if a writer is killed."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ def test_threads_and_processes_that_write_one_file_leave_a_whole_one(tmp_path: P
 
 
 def begun(path: Path, by: str = "atomic_write") -> tuple[subprocess.Popen[str], Path]:
-    """A process in the middle of writing, and what it writes to."""
+    """Start a process that stops in the middle of a write, and return it with its
+    temporary file."""
     child = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path), by],
         stdin=subprocess.PIPE,

@@ -1,5 +1,5 @@
-"""Recordings of all formats with missing, empty and truncated images: the other frames are
-mapped."""
+"""Test recordings of all formats with missing, empty and truncated images: the other
+frames are mapped."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_7_scenes_leaves_damaged_frames_out(tmp_path: Path, suffixes: tuple[str,
 
 
 def test_a_frame_without_both_images_keeps_the_times_of_others(recording: Path):
-    """Only times.txt shows that there was a frame."""
+    """Only times.txt shows that the frame existed."""
     before = open_sequence(recording)
     names = sorted(path.name for path in (recording / "image_0").iterdir())
     for folder in ("image_0", "image_1"):
@@ -179,7 +179,7 @@ def test_a_frame_without_both_images_keeps_the_times_of_others(recording: Path):
 
 
 def test_what_is_missing_cannot_be_guessed(recording: Path):
-    """Of names that begin at 1 the first or the last may be missing."""
+    """If names begin at 1, the first or the last image may be missing."""
     for folder in ("image_0", "image_1"):
         (recording / folder / "000000.png").unlink()
     with pytest.raises(RecordingError, match=r"times\.txt: 14 times for 13 pictures"):

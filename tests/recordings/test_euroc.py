@@ -51,7 +51,7 @@ def test_times_that_differ_by_nanoseconds(euroc: Path):
 
 
 def camchain(motion: str, **matrices: np.ndarray) -> str:
-    """Kalibr's file of the two cameras; cam1 has `motion` beside its mounting."""
+    """Return Kalibr's file of the two cameras. cam1 has `motion` beside its mounting."""
     text = ""
     for number, body_from_cam in enumerate(BODY_FROM_CAM):
         sensor = sensor_yaml(body_from_cam).split("\n")

@@ -1,5 +1,4 @@
-"""The focal length in EXIF data: both byte orders, both ways of giving it, and data that gives none
-or is damaged."""
+"""Test the focal length in EXIF data: both byte orders, both tags, and missing or damaged data."""
 
 from __future__ import annotations
 
@@ -17,8 +16,8 @@ FOCAL, FOCAL_35MM, WIDTH, RESOLUTION, UNIT = 0x920A, 0xA405, 0xA002, 0xA20E, 0xA
 
 
 def _exif(order: str, tags: dict[int, tuple[int, int, int]]) -> bytes:
-    """A TIFF block: one directory that points to the EXIF directory; each tag as (type, numerator,
-    denominator)."""
+    """Return a TIFF block with one directory that points to the EXIF directory. Each tag is (type,
+    numerator, denominator)."""
     start, entries, values = 26, b"", b""
     after = start + 2 + 12 * len(tags) + 4
     for tag, (kind, numerator, denominator) in sorted(tags.items()):

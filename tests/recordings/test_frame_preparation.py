@@ -1,4 +1,4 @@
-"""Frames made ready for measuring: rectification, and depth brought into the picture's camera."""
+"""Test prepared frames: rectified pairs, and depth registered to the image's camera."""
 
 from __future__ import annotations
 

@@ -264,7 +264,7 @@ def test_large_images_are_reduced(tmp_path: Path, suffix: str):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak is read from /proc")
 def test_a_webp_image_of_50_megapixels_takes_little_memory(tmp_path: Path):
-    """Pillow takes 770 MB for it."""
+    """Pillow needs 770 MB for it."""
     Pillow.new("RGB", (7070, 7070)).save(tmp_path / "black.webp")
     code = PEAK_KB + (
         "from pathlib import Path; from topoloc import read_image;"

@@ -1,4 +1,4 @@
-"""Frames in memory as a recording, and what is said of arrays of another type, shape or unit."""
+"""Test frames in memory as a recording, and errors for arrays of another type, shape or unit."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import pytest
 import topoloc
 from tiny_recordings import HEIGHT, WIDTH, assert_slices, picture, pose
 from topoloc.errors import RecordingError
-from topoloc.recordings.frame import StereoSequence, sequence_subset
-from topoloc.recordings.frame_checks import find_image_problem
+from topoloc.recordings.frame import StereoSequence, find_image_problem, sequence_subset
 
 CAMERA = topoloc.Camera.pinhole(WIDTH, HEIGHT, 40.0, 41.0, 15.5, 11.5)
 RIG = topoloc.StereoRig.rectified(CAMERA, 0.12)
@@ -54,8 +53,7 @@ def test_a_sequence_of_frames():
 
 
 def changed(frame: topoloc.StereoFrame, **fields: Any) -> topoloc.StereoFrame:
-    """A frame as a program without type checks makes it; the tests' own checks look at what is
-    constructed."""
+    """Change a frame without type checks, because the tests' own checks run in the constructor."""
     for name, value in fields.items():
         object.__setattr__(frame, name, value)
     return frame

@@ -1,4 +1,5 @@
-"""Recordings as programs and devices write them: each opens, and each of its frames is read."""
+"""Test recordings as programs and devices write them: each opens, and each of its
+frames is read."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from topoloc.slam.pose_checks import check_poses
 
 @pytest.fixture
 def cases(shared: Path) -> Path:
-    """The folder of these recordings."""
+    """Return the folder of these recordings."""
     folder = shared / "cases" / "turn3"
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}")
@@ -90,5 +91,6 @@ def test_a_negative_focal_length_is_named_and_mended(cases: Path, tmp_path: Path
 
 
 def test_short_steps_accuse_no_poses(cases: Path):
-    """From few points the direction of a short step is wrong by 70 degrees; the poses are right."""
+    """With few points, the direction of a short step is wrong by 70 degrees. The
+    poses are right."""
     check_poses(open_sequence(cases / "colmap_simple_radial_fisheye"))

@@ -87,7 +87,7 @@ def test_kitchen(shared: Path):
 
 
 def test_kitchen_depth_edges_fall_on_colour_edges(shared: Path):
-    """The transform, its focal length and its direction, by the picture itself."""
+    """The images confirm the transform, its direction and its focal length."""
     sequence = open_sequence(shared / "data" / "seven_scenes" / "kitchen" / "seq-01")
     frames = [sequence[index] for index in range(0, 350, 25)]
 

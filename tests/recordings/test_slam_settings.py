@@ -1,5 +1,5 @@
-"""Settings files of VINS-Mono, VINS-Fusion, ORB-SLAM2 and ORB-SLAM3, as these programs ship them,
-are calibrations."""
+"""Check that settings files shipped with VINS-Mono, VINS-Fusion, ORB-SLAM2 and ORB-SLAM3 are read
+as calibrations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.calibration import parse_calibration
-from topoloc.recordings.camera_json import CameraCalibration
+from topoloc.recordings.camera_files import CameraCalibration
 from topoloc.recordings.open import open_sequence
 
 Read = Callable[[str], CameraCalibration]
@@ -142,7 +142,8 @@ ThDepth: 35
 
 @pytest.fixture
 def calibration(tmp_path: Path) -> Read:
-    """Read a file with this text, for images of 752x480 if it does not say their size."""
+    """Return a function that reads a file with this text, for images of 752x480 if it does not
+    give their size."""
 
     def read(text: str) -> CameraCalibration:
         (tmp_path / "settings.yaml").write_text(text)
@@ -253,7 +254,7 @@ def test_a_pair_of_orb_slam2_that_is_not_rectified(calibration: Read):
 
 
 def test_depth_of_orb_slam(calibration: Read):
-    """bf is that of a projector there."""
+    """In these files, bf belongs to a projector."""
     for key in ("DepthMapFactor", "RGBD.DepthMapFactor"):
         found = calibration(ORB2 + f"{key}: 5000.0\n")
         assert (found.rig, found.depth_factor) == (None, 5000.0)
@@ -304,7 +305,7 @@ def test_a_recording_with_such_files_beside_it(tmp_path: Path):
 def test_build_and_localize_with_the_settings_of_orb_slam(
     tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Of a KITTI-like recording whose calib.txt is gone."""
+    """The recording is KITTI-like, but without calib.txt."""
     recording = Path(shutil.copytree(tiny_recording, tmp_path / "walk"))
     frame = open_sequence(recording)[0]
     assert frame.camera is not None

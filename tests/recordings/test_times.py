@@ -1,4 +1,4 @@
-"""Times are read in the unit that gives a date, or a plausible rate."""
+"""Check that times are read in the unit that gives a date or a plausible frame rate."""
 
 from pathlib import Path
 

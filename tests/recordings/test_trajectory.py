@@ -240,7 +240,7 @@ def test_own_poses_are_read_as_told():
 
 
 def recording_of(t_ns: list[int]) -> Recording:
-    """A recording of no pictures."""
+    """Return a recording without images."""
     return Recording(
         "none", Path(), [f"{k}.png" for k in range(len(t_ns))], t_ns, [None] * len(t_ns), None
     )
@@ -277,7 +277,7 @@ def test_read_at_once_or_line_by_line_it_is_the_same(tmp_path: Path, lines: list
 
 
 def test_exact_times_are_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A million lines take seconds only where they are not gone through one by one."""
+    """A million lines take only seconds, because they are not parsed one by one."""
     poses = [pose(index) for index in range(5)]
     Trajectory(poses, [1_700_000_000_123_456_789 + index for index in range(5)]).write_tum(
         tmp_path / "a.tum"

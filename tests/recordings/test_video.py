@@ -1,4 +1,4 @@
-"""Videos written by OpenCV and read back: order, times, calibration, and files that are broken."""
+"""Test videos written by OpenCV: frame order, times, calibration, and broken files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NUM_FRAMES = 12
 
 
 def write_video(path: Path, greys: list[int], codec: str = "mp4v", rate: float = 25.0) -> Path:
-    """Pictures of one grey each."""
+    """Write frames of uniform grey."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate, SIZE)
     assert writer.isOpened()
     for grey in greys:
@@ -117,7 +117,7 @@ def test_a_film_that_was_cut_off_ends_with_its_last_whole_frame(tmp_path: Path):
 
 
 class _Clock:
-    """A reader whose container gives these times."""
+    """Stand in for a reader whose container gives these times."""
 
     def __init__(self, milliseconds: list[float]) -> None:
         self._left = list(milliseconds)
@@ -163,7 +163,7 @@ def test_a_frame_of_another_resolution_is_unreadable_alone(
     sequence = video.open_video(film)
 
     class Larger:
-        """Gives a picture of another size from its third frame on."""
+        """Return an image of another size from the third frame on."""
 
         def __init__(self) -> None:
             self.number = -1

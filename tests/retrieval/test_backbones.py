@@ -1,4 +1,4 @@
-"""The backbones are torchvision's, name by name and number by number."""
+"""Compare the backbones with torchvision's, name by name and value by value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Cells of a network beside VLAD: places known from beside the map's way, also in another light."""
+"""Test the cells of a network with VLAD: places are recognised from beside the mapped path, also
+in other light."""
 
 from __future__ import annotations
 
@@ -18,10 +19,9 @@ from topoloc.mapping.config import MapConfig
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import read_image
 from topoloc.retrieval import descriptor_index
-from topoloc.retrieval.cell_grid import CellGrid
 from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
 from topoloc.retrieval.descriptor_kernels import max_shifted_products
-from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
+from topoloc.retrieval.vlad import CellGrid, SurfVlad, append_positions, learn_words, vlad
 
 NO_IMAGE = np.zeros((6, 8), np.uint8)
 ROWS, COLUMNS, CHANNELS = 4, 6, 16
@@ -29,7 +29,7 @@ CONFIG = VladConfig(num_words=4, position_weight=0.0)
 
 
 def places(count: int, seed: int = 0, columns: int = COLUMNS) -> np.ndarray:
-    """Cells of as many places, which have half of what they show in common."""
+    """Return the cells of `count` places, which share half of their content."""
     rng = np.random.default_rng(seed)
     common = rng.normal(size=(ROWS, columns, CHANNELS))
     return (common + rng.normal(size=(count, ROWS, columns, CHANNELS))).astype(np.float32)
@@ -40,7 +40,7 @@ def most_alike(grid: CellGrid, cells: np.ndarray, count: int) -> int:
 
 
 def alike_by_vlad(cells: np.ndarray | None, count: int = 40) -> tuple[SurfVlad, Features]:
-    """A map of pictures that VLAD cannot tell apart, and the features of each."""
+    """Return a map of images with equal VLAD vectors, and the features of each."""
     rows = np.random.default_rng(7).normal(size=(200, 64))
     rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
     zero = np.zeros(200, np.float32)
@@ -183,8 +183,8 @@ def test_a_damaged_model_is_told(name: str, change):
 
 
 def test_a_real_walk_by_day_is_known_by_night(shared: Path):
-    """Frames of equal numbers show the same place, but for two frames; and the day's walk may have
-    been beside the night's."""
+    """Frames of equal numbers show the same place within two frames. The walk by day may be beside
+    the walk by night."""
     walks = shared / "data" / "gardenspoint"
     if not walks.is_dir():
         pytest.skip(f"no walks at {walks}")

@@ -1,4 +1,4 @@
-"""Search among place vectors, and the nodes it names."""
+"""Test the search in global descriptors, and the nodes that it returns."""
 
 from __future__ import annotations
 
@@ -99,7 +99,8 @@ def test_words_do_not_depend_on_the_number_of_threads_which_stays_as_it_was():
 
 
 def test_each_python_thread_has_its_own_number_of_faiss_threads():
-    """So `single_faiss_thread` needs no lock: whoever leaves last changes nobody's number."""
+    """`single_faiss_thread` needs no lock, because the last thread to leave changes no other
+    thread's number."""
     entered, left, seen = threading.Event(), threading.Event(), list[int]()
     before = faiss.omp_get_max_threads()
 

@@ -1,5 +1,5 @@
-"""Networks answer several threads as they answer one; PyTorch's number of threads is as before,
-whoever leaves last."""
+"""Check that networks return equal results in several threads and restore PyTorch's
+number of threads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vocabularies that ship: small, said where they come from, and the same whoever reads them."""
+"""Test the shipped vocabularies: small, with a stated source, and equal for each reader."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_other_kinds_have_none():
 
 
 def test_pictures_of_the_same_things_have_like_vectors():
-    """Things: descriptors about some of the words, each picture with noise of its own."""
+    """An object is a set of descriptors near some words. Each image adds its own noise."""
     vocabulary = shared_vocabulary("surf")
     assert vocabulary is not None
     words = vocabulary.words[:, :64]

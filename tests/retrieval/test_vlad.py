@@ -1,5 +1,4 @@
-"""surf-vlad: vectors of places, what is learnt from them, and whether the right node comes
-first."""
+"""Test surf-vlad: the vectors of places, the learned words, and the rank of the right node."""
 
 from __future__ import annotations
 
@@ -52,8 +51,8 @@ def feature_config_for(rows: np.ndarray) -> Features:
 def fitted(
     num_images: int, images_a_node: int = 2, dimension: int = 128, num_words: int = 8
 ) -> tuple[SurfVlad, list[np.ndarray]]:
-    """A localizer of places that each have descriptors of their own, and the descriptors of the
-    places' images."""
+    """Return a localizer of places with different descriptors, and the descriptors
+    of their images."""
     rows = [
         descriptors(
             120, k, unit(np.random.default_rng(1000 + k // images_a_node).standard_normal((10, 64)))
@@ -138,8 +137,8 @@ def test_a_place_seen_again_comes_first(dimension: int):
 
 
 def things(order: np.ndarray) -> Features:
-    """Sixty things side by side in a picture 200 pixels wide, the same in every picture but for
-    their order."""
+    """Return sixty objects side by side in an image 200 pixels wide. Images differ only
+    in their order."""
     things_seen = descriptors(60, 11)
     zero = np.zeros(60, np.float32)
     columns = np.stack([3.0 + 3.25 * np.arange(60), np.full(60, 50.0)], axis=1).astype(np.float32)
@@ -233,7 +232,7 @@ def test_the_stored_model_ranks_alike():
 
 
 def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig) -> float:
-    """Of the queries, those with a node within 2 D_thresh (Eq. 1) among the five best."""
+    """Return the share of queries with a node within 2 D_thresh (Eq. 1) among the five best."""
     topomap = build_map(topoloc.open_sequence(map_part), config)
     nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     coarse = open_coarse_localizer(topomap.first_layer.coarse_models["surf-vlad"])

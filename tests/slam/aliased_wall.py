@@ -1,8 +1,8 @@
-"""A wall of equal panels a metre apart, walked along by a stereo camera that looks at it: what SLAM
-is to survive without frames.
+"""Render a wall of equal panels one metre apart, seen by a stereo camera that moves along it. SLAM
+must handle lost frames there.
 
-The wall runs along the world's +x, 1.6 m before the camera. Its texture repeats exactly; boards,
-each another one, hang where a test wants them.
+The wall runs along the world's +x, 1.6 m in front of the camera. Its texture repeats exactly. Tests
+may add boards, all different.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _WALL, _UP_DOWN, _RIGHT = 1.6, np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0
 
 @cache
 def wall(boards: tuple[float, ...] = ()) -> list[Panel]:
-    """The wall from x = -3 m to 21 m, above a plain floor; boards are 0.6 m wide."""
+    """Return the wall from x = -3 m to 21 m, above a plain floor. Boards are 0.6 m wide."""
     one = smooth_texture(7, (PERIOD / 2, 1.2))
     panels = [
         Panel(
@@ -53,7 +53,7 @@ def wall(boards: tuple[float, ...] = ()) -> list[Panel]:
 
 
 def pose_at(x: float) -> Rigid3:
-    """world_from_cam of who walks along the wall, swaying a little."""
+    """Return world_from_cam of a camera that moves along the wall and sways a little."""
     sway = exp_so3(np.array([0.0, 0.0, 0.02 * np.sin(2.1 * x)])) @ exp_so3(
         np.array([0.01 * np.cos(3.0 * x), 0.0, 0.0])
     )
@@ -83,7 +83,7 @@ def _frame(x: float, boards: tuple[float, ...]) -> StereoFrame:
 def walk_along(
     places: Sequence[float], times: Sequence[float], boards: tuple[float, ...] = ()
 ) -> FrameList:
-    """Frames at these places (metres along the wall) and times (seconds)."""
+    """Return frames at these places (metres along the wall) and times (seconds)."""
     frames = [
         replace(_frame(float(x), boards), t_ns=round(t * 1e9))
         for x, t in zip(places, times, strict=True)

@@ -1,5 +1,5 @@
-"""SLAM along a wall of equal panels: frames that are missing never cost a whole panel in
-silence."""
+"""Test SLAM along a wall of equal panels: lost frames never cause an unreported error of
+a whole panel."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ GONE = range(10, 14)
 def kept(
     num: int, gone: Sequence[int] = GONE, jump: float = 0.0
 ) -> tuple[list[float], list[float]]:
-    """Places and times of a walk without some frames, after which the camera is `jump` metres
-    further than it walked."""
+    """Return places and times of a walk without some frames. After the gap, the camera is `jump`
+    metres further."""
     rows = [k for k in range(num) if k not in gone]
     return [STEP * k + (jump if k > gone[-1] else 0.0) for k in rows], [0.1 * k for k in rows]
 
 
 def along_the_wall(sequence: FrameList, result: SlamResult) -> np.ndarray:
-    """Metres by which each frame is off along the wall, NaN without pose."""
+    """Return the error in metres of each frame along the wall, NaN without a pose."""
     first = sequence.poses[0]
     assert first is not None
     errors = []
@@ -50,7 +50,8 @@ def test_four_frames_lost_are_bridged_by_the_motion():
 
 
 def test_eight_frames_lost_are_bridged_although_another_panel_is_nearer():
-    """The camera has gone a whole panel on: to stand still would explain the picture as well."""
+    """The camera moved on by a whole panel. A camera at rest would explain the
+    image equally well."""
     walked = walk_along(*kept(22, range(10, 18)))
     result = run_slam(walked)
     assert result.num_submaps == 1
@@ -58,8 +59,8 @@ def test_eight_frames_lost_are_bridged_although_another_panel_is_nearer():
 
 
 def test_what_the_motion_cannot_decide_is_a_submap_of_its_own():
-    """Half a panel further than expected, one panel is as likely as the other: none of them is
-    claimed."""
+    """The camera is half a panel further than predicted, so that two panels are equally likely.
+    SLAM selects neither."""
     walked = walk_along(*kept(20, jump=0.5 * PERIOD))
     result = run_slam(walked)
     assert (result.num_submaps, result.num_joined) == (2, 1)
@@ -70,8 +71,8 @@ def test_what_the_motion_cannot_decide_is_a_submap_of_its_own():
 
 
 def test_a_submap_is_joined_by_what_is_unique_and_by_no_panel():
-    """There and back: the gap was too long for the motion, and a board before it is seen again on
-    the way back."""
+    """The camera goes there and back. The gap is too long for prediction, and a board before it is
+    seen again on return."""
     there, times = kept(24, jump=0.5)
     back = list(np.arange(there[-1] - STEP, 0.3, -STEP))
     walked = walk_along(
@@ -84,7 +85,7 @@ def test_a_submap_is_joined_by_what_is_unique_and_by_no_panel():
 
 
 def worst_step(sequence: FrameList, result: SlamResult) -> float:
-    """Metres by which the step between two successive poses of one world is off, at most."""
+    """Return the largest error in metres of a step between two successive poses of one world."""
     worst = 0.0
     for poses in (result.poses[0], *result.apart[0]):
         rows = [row for row, pose in enumerate(poses) if pose is not None]
@@ -109,8 +110,8 @@ THERE_AND_BACK = 0.3 * np.concatenate([np.arange(10), np.arange(9)[::-1]])
 def test_between_two_steps_that_look_the_same_the_submap_ends(
     places: np.ndarray, boards: tuple[float, ...]
 ):
-    """No frame is lost. Each of these walks was a whole panel off without a word: a step of more
-    than half a panel looks like a shorter one back."""
+    """No frame is lost. A step of more than half a panel looks like a shorter one back. Each of
+    these walks once had an unreported error of a whole panel."""
     walked = walk_along(places.tolist(), (0.1 * np.arange(len(places))).tolist(), boards)
     result = run_slam(walked)
     assert result.num_submaps > 1
@@ -118,7 +119,8 @@ def test_between_two_steps_that_look_the_same_the_submap_ends(
 
 
 def test_where_boards_are_in_view_an_uneven_walk_is_followed():
-    """The motion does not tell the steps apart, of which most are 0.2 to 0.7 m. The images do."""
+    """Motion prediction cannot distinguish the steps, most of which are 0.2 to 0.7 m.
+    The images can."""
     steps = 0.45 * (1.0 + 0.4 * np.random.default_rng(5).standard_normal(24))
     boards = tuple(np.arange(-0.5, 12.0, 1.5))
     walked = walk_along(np.cumsum(steps).tolist(), (0.1 * np.arange(24)).tolist(), boards)
@@ -129,8 +131,8 @@ def test_where_boards_are_in_view_an_uneven_walk_is_followed():
 
 @pytest.mark.parametrize(("step", "num_gone"), [(0.35, 4), (0.25, 8)])
 def test_panels_between_boards_join_nothing(step: float, num_gone: int):
-    """After the gap two boards are seen that were not, and panels that look like those before. The
-    pieces were joined four panels off by those images that show one panel."""
+    """After the gap, the images show two new boards and panels like the earlier ones. Images that
+    show one panel once joined the pieces four panels off."""
     rows = [k for k in range(24) if not 10 <= k < 10 + num_gone]
     boards = tuple(np.arange(-0.5, 9.0, 2.0))
     walked = walk_along([step * k for k in rows], [0.1 * k for k in rows], boards)
@@ -148,8 +150,7 @@ def test_who_turns_back_before_the_wall_is_not_taken_for_lost():
 
 
 def test_where_boards_hang_on_the_panels_a_jump_is_followed():
-    """What does not repeat itself needs no motion to be told apart; between the boards the wall
-    still repeats itself."""
+    """Unique boards make motion prediction unnecessary, although the wall between them repeats."""
     walked = walk_along(*kept(18, jump=0.5), boards=tuple(np.arange(-2.0, 5.0, 0.65)))
     result = run_slam(walked)
     assert result.num_submaps == 1
@@ -159,7 +160,7 @@ def test_where_boards_hang_on_the_panels_a_jump_is_followed():
 @pytest.mark.parametrize("is_stereo", [True, False])
 @pytest.mark.parametrize("step", [0.06, 0.12])
 def test_equal_panels_accuse_no_poses(step: float, is_stereo: bool):
-    """From panel to panel the images match as well as with the right step, or better."""
+    """A step to the next panel matches the images as well as the right step, or better."""
     walked = walk_along([step * k for k in range(40)], [0.1 * k for k in range(40)])
     alone = [replace(frame, right=None, rig=None) for frame in walked.frames]
     check_poses(walked if is_stereo else FrameList(alone))

@@ -1,4 +1,4 @@
-"""Systems of 6x6 blocks against NumPy's dense solution, and what their factors cost."""
+"""Test systems of 6x6 blocks against NumPy's dense solution, and the size of their factors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from topoloc.slam.bundle.block_system import BlockPattern, solve_blocks
 
 
 def dense_of(num: int, pairs: list[tuple[int, int]], seed: int = 0) -> np.ndarray:
-    """A positive definite matrix whose blocks of these pairs are other than zero."""
+    """Return a positive definite matrix. Only the blocks of these pairs are non-zero."""
     rng = np.random.default_rng(seed)
     dense = 0.1 * np.eye(6 * num)
     for i, j in pairs:
@@ -51,8 +51,8 @@ def test_the_solution_is_that_of_a_dense_matrix(pairs: list[tuple[int, int]]):
 
 
 def test_a_walk_of_several_laps_has_a_factor_that_grows_with_its_length():
-    """Each pose is tied to the six before it, and on every later lap to those that stood there
-    before."""
+    """Each pose has edges to the six before it, and on later laps to the poses at
+    the same place."""
 
     def laps(length: int, num_laps: int) -> list[tuple[int, int]]:
         num = length * num_laps

@@ -1,4 +1,4 @@
-"""Bundle adjustment of made-up key frames whose truth is known."""
+"""Test bundle adjustment of synthetic key frames with known truth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.disparity import StereoCamera
+from topoloc.points.metric_points import StereoCamera
 from topoloc.slam.bundle.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations
 
@@ -18,8 +18,8 @@ NOISE_PX = 0.2
 def world(
     num: int = 5, bias_px: float = 0.0
 ) -> tuple[list[KeyFrame], Landmarks, list[Rigid3], np.ndarray]:
-    """Key frames going sideways and ahead past a cloud of points, all seen by all; their poses and
-    points are wrong at first."""
+    """Return key frames that move past a cloud of points, visible in all of them. Poses and points
+    have initial errors."""
     rng = np.random.default_rng(4)
     points = np.column_stack(
         [rng.uniform(-3, 4, 150), rng.uniform(-1.5, 1.5, 150), rng.uniform(3, 12, 150)]
@@ -100,8 +100,8 @@ def test_unknown_disparities_do_no_harm():
 
 
 def walk_around(num: int, num_new: int) -> tuple[list[KeyFrame], Landmarks, list[Rigid3]]:
-    """Twice around a ring; each key frame sees what lies before it and the two before it. The poses
-    drift at first."""
+    """Walk twice around a ring. Each key frame observes its own points and the points of two frames
+    before it. The poses drift at first."""
     rng = np.random.default_rng(7)
     step = Rigid3.exp(np.array([0.0, 0.0, -0.3, 0.0, 4.0 * np.pi / num, 0.0]))
     poses = [Rigid3.exp(np.zeros(6))]
@@ -158,7 +158,7 @@ def test_part_by_part_is_the_same_as_all_at_once():
 
 @pytest.mark.slow
 def test_a_walk_of_many_key_frames_is_adjusted_whole():
-    """More of them than a dense matrix was ever allowed."""
+    """The number of key frames exceeds the former limit of a dense matrix."""
     keyframes, landmarks, poses = walk_around(700, 8)
     before = pose_errors(keyframes, poses)
     adjust_bundle(keyframes, [], landmarks, max_steps=12, chunk_size=5000)

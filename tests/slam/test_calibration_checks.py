@@ -1,5 +1,5 @@
-"""Errors of a calibration by some percent are refused with the value that is right, and obeying
-the message mends them. Right recordings pass."""
+"""Check that calibration errors of some percent are refused with the right value, and that this
+value solves the fault. Right recordings pass."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def with_rig(frame: StereoFrame, camera: Camera, baseline: float) -> StereoFrame
 
 
 def with_focal(recording: Recording, factor: float) -> Recording:
-    """The recording with this factor in its focal length."""
+    """Return the recording with its focal length multiplied by this factor."""
     assert recording.right is not None
     c = recording.right.rig.left
     camera = Camera.pinhole(c.width, c.height, factor * c.fx, factor * c.fy, c.cx, c.cy)
@@ -88,7 +88,7 @@ def test_a_right_recording_without_poses_has_no_fault(shared: Path):
 
 
 def test_a_street_names_the_focal_length_as_well(shared: Path):
-    """Without rotations a wrong focal length looks like a wrong baseline."""
+    """Without rotations, a wrong focal length looks like a wrong baseline."""
     street = open_recording(shared / "data" / "kitti" / "sequences" / "street1")
     check_poses(street)
     with pytest.raises(TrajectoryError, match=r"a baseline of .* or the focal length is wrong"):
@@ -96,7 +96,8 @@ def test_a_street_names_the_focal_length_as_well(shared: Path):
 
 
 def test_a_disparity_error_of_half_a_pixel_accuses_nobody(shared: Path):
-    """Depth of this street is 12 % more than its poses show, by half a pixel at 75 m."""
+    """Depth in this street is 12 % larger than its poses show: half a pixel of
+    disparity at 75 m."""
     check_poses(open_sequence(shared / "data" / "kitti" / "sequences" / "street2@25:51"))
 
 

@@ -1,5 +1,5 @@
-"""Stereo pairs that would give a wrong map are refused whatever the source of poses, right ones are
-not. A wrong baseline or depth factor is named before the poses."""
+"""Check that stereo pairs which would give a wrong map are refused, whatever the source of poses. A
+wrong baseline or depth factor is named before the poses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Odometry of a single camera: the motion is found in a unit of its own, and a camera that only
-turns has none."""
+"""Test odometry of a single camera: motion in an unknown unit, and none for a camera
+that only rotates."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ TENTH = 100_000_000
 
 
 def ahead(metres: float) -> Rigid3:
-    """cam_from_world of a camera `metres` along x."""
+    """Return cam_from_world of a camera `metres` along x."""
     return Rigid3(np.eye(3), np.array([-metres, 0.0, 0.0]))
 
 
@@ -55,8 +55,8 @@ def test_an_unsteady_walk_is_trusted_less_and_less_as_time_goes():
 
 
 def test_sigma_covers_what_acceleration_does():
-    """Walks whose acceleration is noise: how far they are from the prediction four frames later, in
-    sigma."""
+    """For walks with random acceleration, compare the error of a prediction over four frames
+    with its sigma."""
     rng = np.random.default_rng(0)
     distances = []
     for _ in range(200):

@@ -1,4 +1,4 @@
-"""Trajectories of a wrong convention are named, right ones are not accused."""
+"""Check that trajectories of a wrong convention are named, and that right ones pass."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -45,7 +45,7 @@ WRONG: dict[str, tuple[Callable[[Rigid3], Rigid3], tuple[str, ...]]] = {
 
 
 def walk(num_frames: int) -> list[Rigid3]:
-    """A camera carried by hand: it goes on, sways, and looks around."""
+    """Return poses of a hand-held camera that moves on, sways, and looks around."""
     k = np.arange(num_frames)
     ways = np.column_stack([np.sin(0.13 * k), 0.1 * np.sin(0.31 * k), 0.08 * k])
     turns = np.column_stack(
@@ -59,8 +59,8 @@ POSES, T_NS = walk(120), [100_000_000 * k for k in range(120)]
 
 
 def steps_of(poses: list[Rigid3], seed: int) -> list[MeasuredStep]:
-    """Steps as pictures would give them: a few millimetres and a fifth of a degree off, one of them
-    wrong."""
+    """Return steps as images give them: errors of some millimetres and a fifth of a degree,
+    and one outlier."""
     rng, steps = np.random.default_rng(seed), []
     for first in range(0, 105, 7):
         noise = Rigid3(exp_so3(rng.normal(0.0, 0.003, 3)), rng.normal(0.0, 0.005, 3))
@@ -86,7 +86,7 @@ def test_a_wrong_convention_is_named(name: str):
 
 
 def without_metres(steps: list[MeasuredStep]) -> list[MeasuredStep]:
-    """The same steps as a single camera gives them."""
+    """Return the same steps as a single camera gives them."""
     ways = [step.first_from_last.translation for step in steps]
     units = [
         Rigid3(step.first_from_last.rotation, way / np.linalg.norm(way))

@@ -1,4 +1,4 @@
-"""Pose graphs whose loops close, and one that a wrong loop tries to bend."""
+"""Test pose graphs with closed loops, and one with a wrong loop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COVARIANCE = np.diag([1e-4] * 3 + [1e-5] * 3)
 
 
 def ring() -> tuple[list[Rigid3], list[Rigid3], list[Edge]]:
-    """The true cam_from_world of a round walk, the drifted one, and its motion edges."""
+    """Return cam_from_world of a round walk, true and with drift, and its motion edges."""
     step = Rigid3(exp_so3(np.array([0.0, 2 * np.pi / NUM, 0.0])), np.array([0.0, 0.0, -0.5]))
     drift = Rigid3.exp(np.array([0.004, 0.0, 0.006, 0.0, 0.004, 0.0]))
     true, drifted, edges = [Rigid3.identity()], [Rigid3.identity()], []

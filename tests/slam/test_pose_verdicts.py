@@ -1,4 +1,5 @@
-"""Right poses of real recordings are accepted, wrong ones refused: with depth and without."""
+"""Check that right poses of real recordings pass and wrong ones are refused, with
+depth and without."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ WRONG: dict[str, Callable[[Rigid3], Rigid3]] = {
 
 
 def shifted(sequence: StereoSequence, seconds: float) -> Poses:
-    """The poses of a clock that is not the images'."""
+    """Return the poses shifted in time against the images."""
     posed = [(p, t) for p, t in zip(sequence.poses, sequence.t_ns, strict=True) if p is not None]
     trajectory = Trajectory([pose for pose, _ in posed], [time for _, time in posed])
     return trajectory.interpolate([t + round(seconds * 1e9) for t in sequence.t_ns], 1.0)

@@ -1,4 +1,5 @@
-"""Links between pieces of a recording: the way between them is known, only the gaps are free."""
+"""Test links between pieces of a recording: the path within a piece is known, only the
+gaps are free."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import pytest
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.points.disparity import StereoCamera
+from topoloc.points.metric_points import StereoCamera
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Observations
 from topoloc.slam.loop_closure import Link, is_reachable
 from topoloc.slam.place_matching import PlaceMatch
@@ -18,8 +19,8 @@ STEP, NUM, GAP = 0.3, 20, 4  # metres and frames, of which ten a second
 
 
 def walked() -> list[KeyFrame]:
-    """Three pieces of a straight walk along +z, each in a world of its own; GAP frames are lost
-    between two of them."""
+    """Return three pieces of a straight walk along +z, each in its own world frame. GAP frames are
+    lost between two of them."""
     keyframes = []
     for submap in range(3):
         own = Rigid3(exp_so3(np.array([0.0, 0.7 * submap, 0.0])), np.array([submap, 2.0, 0.0]))
@@ -32,7 +33,7 @@ def walked() -> list[KeyFrame]:
 
 
 def link(source: int, target: int, ahead: float) -> Link:
-    """The target sees what the source sees, from `ahead` metres further on."""
+    """Return a link: the target sees the same as the source, from `ahead` metres further."""
     target_from_source = Rigid3(np.eye(3), np.array([0.0, 0.0, -ahead]))
     rows = np.zeros(0, int)
     return Link(source, target, PlaceMatch(target_from_source, np.eye(6), rows, rows))

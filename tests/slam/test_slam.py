@@ -1,5 +1,5 @@
-"""SLAM as a whole, on a rendered room with exact truth and on short pieces of real recordings, in
-good light and in bad."""
+"""Test SLAM as a whole, on a rendered room with exact truth and on short real recordings, in good
+and bad light."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def test_depth_images_do_as_well():
 
 
 def test_a_wrong_angle_between_the_cameras_is_found_by_moving():
-    """All disparities are one pixel too large; without the bias everything would be near by a share
-    that grows with depth."""
+    """All disparities are one pixel too large. Without the bias, points would be too near, by a
+    share that grows with depth."""
     sequence = walk(PLACES)
     shifted = [
         replace(f, right=np.roll(f.right, -1, axis=1))

@@ -1,5 +1,5 @@
-"""Sub-maps joined across a gap by what many weak pairs of pictures say together; and not joined by
-one thing that hangs in two rooms."""
+"""Test joins of submaps across a gap: many weak image pairs together suffice, one object in two
+rooms does not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import tiny_world
 from room_frames import RIG, FrameList, walk
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.points.disparity import measured_view
+from topoloc.points.metric_points import measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures
@@ -34,7 +34,8 @@ AROUND = (
 def frames(
     places: np.ndarray, panels: list[tiny_world.Panel], turn: float = 0.0, start_s: float = 0.0
 ) -> list[StereoFrame]:
-    """A tenth of a second after each other, the camera turned to the left by `turn` radians."""
+    """Return frames a tenth of a second apart, with the camera rotated to the left by
+    `turn` radians."""
     made = []
     for i, place in enumerate(places):
         path = tiny_world.path_pose(float(place))
@@ -54,7 +55,7 @@ def frames(
 
 
 def tracked(*recordings: FrameList) -> tuple[list[KeyFrame], list[FramePose]]:
-    """Key frames and known frames of odometry alone."""
+    """Return key frames and frame poses of odometry alone."""
     keyframes: list[KeyFrame] = []
     landmarks, poses = Landmarks(), []
     for number, recording in enumerate(recordings):
@@ -95,7 +96,7 @@ def test_what_both_sides_of_a_gap_see_at_their_edges_joins_them_and_no_frame_is_
 
 @pytest.fixture(scope="module")
 def two_rooms() -> tuple[FrameList, FrameList]:
-    """All is another in the second room but one board, which hangs where it hangs in the first."""
+    """Return frames of two rooms that share one board at the same place and differ in all else."""
     here, there = tiny_world.room(), tiny_world.room(3)
     return FrameList(frames(HERE, here)), FrameList(
         frames(HERE + 0.1, [*there[:3], here[3], there[4]], start_s=10.0)
@@ -115,7 +116,7 @@ def test_a_board_that_hangs_in_two_rooms_joins_them_not(
 
 
 def test_equal_panels_join_nothing():
-    """Each recording is shorter than a panel, so that no other place of it says otherwise."""
+    """Each recording is shorter than a panel, so that no other place contradicts a join."""
     places, times = np.arange(0.0, 1.0, 0.12), list(0.1 * np.arange(9))
     here, there = (walk_along(list(places + start), times) for start in (0.0, 10.06))
     keyframes, _ = tracked(here, there)
@@ -123,7 +124,7 @@ def test_equal_panels_join_nothing():
 
 
 def test_frames_sought_in_vain_at_the_end_are_a_submap():
-    """Six frames elsewhere are fewer than those for which the camera is sought."""
+    """Six frames of another place are fewer than relocalization tries."""
     here, there = walk(list(HERE[:6])), walk(list(HERE[:6]), seed=3)
     later = [replace(frame, t_ns=frame.t_ns + 2_000_000_000) for frame in there.frames]
     keyframes, poses = tracked(FrameList([*here.frames, *later]))

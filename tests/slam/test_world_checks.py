@@ -1,4 +1,5 @@
-"""Recordings with poses in worlds of their own are refused, those of one world are not."""
+"""Check that recordings with poses in different world frames are refused, and that recordings of
+one world pass."""
 
 from __future__ import annotations
 

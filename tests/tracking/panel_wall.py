@@ -1,5 +1,5 @@
-"""A localizer of a wall of equal panels, a metre apart, without pictures or a map: what it answers
-is told to it."""
+"""Simulate the localizer of a wall of equal panels, one metre apart, without images or a map. Tests
+set its results."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.answer import LocalizationWithInliers
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.query import Deadline, QueryImage
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.localization.result_decision import LocalizationWithInliers
 from topoloc.localization.search import Trace
 from topoloc.localization.tiles.tiles import Tiles
 from topoloc.mapping.topomap import TopoMetricMap
@@ -31,8 +31,8 @@ def at(x: float) -> Rigid3:
 
 
 class PanelWall(Localizer):
-    """`xs` are where the next picture may have been taken, the likeliest first; who looks near a
-    pose finds one within half a panel. `probability` is that of a single one."""
+    """Localize each image at one of `xs`, the likeliest first. A search near a pose returns the one
+    within half a panel. `probability` is used if there is only one."""
 
     def __init__(self) -> None:
         self.xs: list[float] = []
@@ -69,7 +69,7 @@ class PanelWall(Localizer):
 
 
 def _answered(x: float, probability: float) -> LocalizationWithInliers:
-    """A pose with points too few to be followed."""
+    """Return a result with too few points for tracking."""
     return Localization(at(x), _SIGMA, probability, int(x), [], 40, 40), _points(x)
 
 
@@ -84,8 +84,8 @@ def _points(x: float) -> PointObservations:
 
 
 class Walk:
-    """A camera that goes along the wall, at x = 0.45 k in picture k; the odometry drifts by a
-    hundredth."""
+    """Simulate a camera that moves along the wall, at x = 0.45 k in image k. Its odometry drifts
+    by one per cent."""
 
     def __init__(self, has_odometry: bool = True) -> None:
         self.wall, self._has_odometry, self._number = PanelWall(), has_odometry, 0
@@ -94,11 +94,12 @@ class Walk:
 
     @property
     def x(self) -> float:
-        """Where the picture seen last was taken."""
+        """Return the place of the last image."""
         return STEP * (self._number - 1)
 
     def see(self, *offsets: float) -> StreamedPose:
-        """The next picture, which may have been taken so far off the truth, the likeliest first."""
+        """Process the next image. Its result may have these offsets from the truth, the
+        likeliest first."""
         number, self._number = self._number, self._number + 1
         self.wall.xs = [STEP * number + offset for offset in offsets]
         image = self._rng.integers(0, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)

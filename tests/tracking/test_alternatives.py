@@ -1,5 +1,5 @@
-"""Streams along a wall of equal panels: alternatives are carried until motion, or something unique,
-decides between them."""
+"""Test streams along a wall of equal panels: alternatives are kept until motion or a unique
+place decides."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The motion model on cameras whose motion is known."""
+"""Test the motion model with cameras of known motion."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SIGMA = np.diag(np.repeat([0.003**2, 0.002**2], 3))
 
 
 def pose_at(seconds: float) -> Rigid3:
-    """A camera on an arc, far from the origin of the world."""
+    """Return the pose of a camera on an arc, far from the origin of the world."""
     return Rigid3(exp_so3(np.array([0.3, -1.0, 0.2])), np.array([40.0, -7.0, 2.0])) @ Rigid3.exp(
         seconds * VELOCITY
     )
 
 
 def followed(num: int, noise: bool = False) -> MotionState:
-    """The state after so many measured poses."""
+    """Return the state after `num` measured poses."""
     rng = np.random.default_rng(0)
     state = start_motion(0, pose_at(0.0), SIGMA)
     for number in range(1, num):

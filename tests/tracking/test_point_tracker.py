@@ -1,5 +1,4 @@
-"""Map points followed through the rendered room, where every pixel's depth and every pose is
-known."""
+"""Track map points through the rendered room, with known depth of each pixel and known poses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What a pose is wrong by: the part that another picture does not share, and the part that
-lasts."""
+"""Test the parts of a pose error: independent per image, or lasting."""
 
 from __future__ import annotations
 

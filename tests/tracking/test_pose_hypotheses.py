@@ -1,4 +1,5 @@
-"""What follows, which of several poses is believed, and when a belief is overruled."""
+"""Test the belief over several poses of a stream: its prediction, its best pose, and when another
+pose replaces that."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ def at(x: float, z: float = 0.0) -> Rigid3:
 
 
 def one_of(*poses: Rigid3, sum_: float = 0.98) -> list[Candidate]:
-    """Candidates that are equally probable."""
+    """Return equally probable candidates."""
     return [
         Candidate(pose, SIGMA, sum_ / len(poses), node_id) for node_id, pose in enumerate(poses)
     ]
@@ -29,13 +30,13 @@ def one_of(*poses: Rigid3, sum_: float = 0.98) -> list[Candidate]:
 def seen(
     hypotheses: PoseHypotheses, t_ns: int, *poses: Rigid3, odom_from_cam: Rigid3 | None = None
 ) -> None:
-    """A picture that may have been taken at any of these poses."""
+    """Process an image with these possible poses."""
     hypotheses.predict(t_ns, odom_from_cam)
     hypotheses.update_weights(t_ns, one_of(*poses), odom_from_cam)
 
 
 def walked_a_second() -> PoseHypotheses:
-    """A camera that has been going along x at 1 m/s for a second."""
+    """Return the hypotheses of a camera that moved along x at 1 m/s for a second."""
     hypotheses = PoseHypotheses(MotionConfig())
     for tenth in range(11):
         seen(hypotheses, tenth * STEP_NS, at(tenth / 10))

@@ -1,4 +1,5 @@
-"""Localized pictures adjusted together: noise averaged, an outlier outvoted, a new beginning."""
+"""Test the joint adjustment of localized images: averaged noise, a rejected
+outlier, and a reset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pose that a user gives to a stream: it decides where places look alike, and is no result."""
+"""Test a user's prior pose for a stream: it decides between similar places, and is no result."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_it_decides_between_two_rooms_that_look_alike(doubled: Localizer, place:
 
 
 def test_it_is_no_result(room_map: Path):
-    """An image of nothing gets no pose from it."""
+    """An image without content gets no pose from the prior."""
     tracker = Tracker(Localizer(TopoMetricMap.load(room_map)))
     pose = room_stream()[0][2]
     tracker.expect(pose, _about(pose), 0)
@@ -68,7 +68,7 @@ def test_a_wrong_one_is_overruled(room_map: Path):
 
 
 def test_a_stream_goes_on_from_it(room_map: Path):
-    """Odometry moves it until an image is localized."""
+    """Odometry moves the prior until an image is localized."""
     tracker = Tracker(Localizer(TopoMetricMap.load(room_map)))
     stream = room_stream()
     (t0, _, before), (t1, image, after) = stream[0], stream[20]

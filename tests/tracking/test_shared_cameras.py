@@ -1,14 +1,13 @@
-"""What several images show of their camera together."""
+"""Test the camera parameters that several images estimate together."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from topoloc.geometry.absolute_pose_focal import camera_prior
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraLikelihood
 from topoloc.geometry.joint_camera.joint_fit import weigh_cameras
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.tracking.shared_cameras import SharedCamera, combine_likelihoods
 
 PRIOR = camera_prior(UncalibratedCamera.unknown(640, 480), 640.0)

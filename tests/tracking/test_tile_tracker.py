@@ -1,4 +1,5 @@
-"""A stream that goes from one tile of an atlas into another one, and through what is in none."""
+"""Test a stream that moves from one tile of an atlas to another, and through places
+outside of all tiles."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ STEP_NS = 100_000_000
 def rooms(
     tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, list[StereoFrame]]:
-    """An atlas of two rooms, and a walk through both."""
+    """Return an atlas of two rooms, and a walk through both."""
     folder = tmp_path_factory.mktemp("rooms")
     other = write_stereo_recording(
         folder / "other", seed=1, indices=np.arange(0.0, 6.0, 0.5).tolist()
@@ -77,7 +78,7 @@ def test_a_walk_is_followed_from_tile_to_tile(
 def test_the_atlas_is_not_asked_again_at_once(
     rooms: tuple[Path, list[StereoFrame]], tracker: Tracker, monkeypatch: pytest.MonkeyPatch
 ):
-    """A refusal by an atlas costs far more than a tracked picture."""
+    """A refusal by an atlas takes far longer than a tracked image."""
     walk, asked = rooms[1], []
     localize = Localizer.localize
     monkeypatch.setattr(

@@ -1,5 +1,5 @@
-"""Streams of the rendered room: the good one, and those that stop, freeze, jump or lie about the
-time."""
+"""Test streams of the rendered room: a good one, and streams with stops, frozen images, jumps
+or wrong times."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def localizer(tiny_recording: Path) -> Localizer:
 
 @pytest.fixture(scope="module")
 def answers(localizer: Localizer) -> list[StreamedPose]:
-    """The whole stream."""
+    """Return the results of the whole stream."""
     return _stream(Tracker(localizer), 0, len(room_stream()))
 
 
@@ -51,7 +51,7 @@ def _stream(tracker: Tracker, first: int, last: int, delay_ns: int = 0) -> list[
 def test_no_further_search_follows_when_the_time_of_an_image_is_over(
     localizer: Localizer, monkeypatch: pytest.MonkeyPatch
 ):
-    """Of a single image and of a stream one deadline holds for all searches."""
+    """One deadline holds for all searches, for a single image and for a stream."""
     limits, search = list[Deadline | None](), localizer.localize_query
 
     def localize_query(query, near=None, max_ms=None):
@@ -84,7 +84,7 @@ def _smoothed(answer: StreamedPose) -> Rigid3:
 
 
 def _jitter(poses: list[Rigid3]) -> float:
-    """Root mean square of the error of each step, metres."""
+    """Return the root mean square of the step errors in metres."""
     truths = [pose for _, _, pose in room_stream()]
     steps = [
         (a.inverse() @ b).translation - (c.inverse() @ d).translation
@@ -141,8 +141,8 @@ def test_the_smoothed_covariance_is_of_the_size_of_the_error(answers: list[Strea
 
 
 def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: list[StreamedPose]):
-    """A map that says more of its own errors is followed as closely, and the answers say as much
-    more."""
+    """A larger error share of the map moves tracked poses by less than 1 cm, and raises
+    their covariance."""
     topomap = built_room(tiny_recording)
     errors = topomap.first_layer.shared_errors
     assert errors is not None

@@ -1,5 +1,5 @@
-"""After warming up nothing is left to compile for a query; a localizer that several threads share
-answers as it does alone."""
+"""Check that a query compiles nothing after the warm-up, and that threads sharing a localizer get
+equal results."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ print(sum(len(answer) > 100 for answer in alone), together == alone * 3)
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str, str]:
-    """A map with side nodes, pictures of it, of its way back and of elsewhere, and their
-    cameras."""
+    """Return files of a map with virtual views, of its images, images in reverse direction, and
+    out-of-map images, with their cameras."""
     folder = tmp_path_factory.mktemp("asked")
     pictures = {f"ahead{k}": picture for k, (picture, _) in enumerate(seen_ahead()[:2])}
     pictures |= {f"back{k}": picture for k, (picture, _) in enumerate(seen_on_the_way_back()[:2])}

@@ -1,4 +1,4 @@
-"""Pictures of the rendered room as a training set, and weights to begin with."""
+"""Provide images of the rendered room as a training set, and initial weights."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from topoloc_training.training_set import TrainingSet
 
 @pytest.fixture(scope="session")
 def room_set(tiny_recording: Path) -> TrainingSet:
-    """What the map of `tiny_recording` teaches."""
+    """Return the training set of the map of `tiny_recording`."""
     return training_set_of(built_room(tiny_recording))
 
 
 @pytest.fixture(scope="session")
 def two_images(room_set: TrainingSet) -> TrainingSet:
-    """A map with one node and two images."""
+    """Return a map with one node and two images."""
     distances = room_set.node_distances[:2, :1]
     return replace(
         room_set,
@@ -35,13 +35,13 @@ def two_images(room_set: TrainingSet) -> TrainingSet:
 
 @pytest.fixture(scope="session")
 def squeezenet_file(shared: Path) -> Path:
-    """SqueezeNet 1.1 as trained on ImageNet, its features."""
+    """Return the weights of SqueezeNet 1.1 trained on ImageNet, features only."""
     return shared / "weights" / "squeezenet1_1-imagenet-features.pth"
 
 
 @pytest.fixture(scope="session")
 def random_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole SqueezeNet of torchvision's layout, with random weights."""
+    """Return a complete SqueezeNet in torchvision's layout, with random weights."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "squeezenet.pth"
     torch.save(Backbone("squeezenet1_1").state_dict(), path)

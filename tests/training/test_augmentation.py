@@ -1,5 +1,5 @@
-"""Variation of training pictures: switched off it changes nothing; on, it stays in range and is the
-same for the same seed."""
+"""Test the augmentation of training images: no change if off, otherwise in range and equal
+for equal seeds."""
 
 from __future__ import annotations
 

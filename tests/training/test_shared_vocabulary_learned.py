@@ -1,5 +1,5 @@
-"""A shared vocabulary learned of a few pictures: places of what it was learned of are told apart,
-and the file holds it exactly."""
+"""Test a shared vocabulary learned from a few images: it distinguishes their places, and its
+file is exact."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from topoloc_training.shared_vocabulary import learn_vocabulary
 
 
 def _picture(seed: int, noise_seed: int) -> tuple[Features, int, int]:
-    """A place of its own for each seed, seen a little otherwise for each other noise."""
+    """Return the features of a place, one per `seed`, with variations by `noise_seed`."""
     rng, noise = np.random.default_rng(seed), np.random.default_rng(noise_seed)
     descriptors = rng.standard_normal((150, 64)) + 0.2 * noise.standard_normal((150, 64))
     unit = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)

@@ -1,5 +1,5 @@
-"""`topoloc train`: a map gets a learned coarse localizer and is asked through it; what fails is
-said in one line."""
+"""Test `topoloc train`: a map gets a learned coarse localizer and uses it, and
+errors are one line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import torch
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, create_atlas
-from topoloc.mapping.storage.integrity_check import list_coarse_models
+from topoloc.mapping.storage.map_reading import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.backbones import Backbone
 
@@ -39,7 +39,7 @@ def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small(tmp_path: Path) -> tuple[str, ...]:
-    """Small pictures and one epoch."""
+    """Return settings for small images and one epoch."""
     path = tmp_path / "small.toml"
     path.write_text(SETTINGS)
     return ("--config", str(path))

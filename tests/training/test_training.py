@@ -1,4 +1,4 @@
-"""What is held out, and the schedule."""
+"""Test the validation split and the schedule."""
 
 from __future__ import annotations
 

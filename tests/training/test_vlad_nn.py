@@ -1,4 +1,4 @@
-"""The NetVLAD layer against its formula, and the vocabulary it begins with."""
+"""Test the NetVLAD layer against its formula, and its initial vocabulary."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def unit(array: np.ndarray) -> np.ndarray:
 
 
 def by_the_formula(maps: np.ndarray, assignment: np.ndarray, centroids: np.ndarray) -> np.ndarray:
-    """Eq. 1 to 4 of the paper, feature by feature."""
+    """Compute Eq. 1 to 4 of the paper, feature by feature."""
     features = unit(maps.reshape(maps.shape[0], -1).T)
     sums = np.zeros(centroids.shape)
     for feature in features:

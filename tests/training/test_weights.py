@@ -1,4 +1,4 @@
-"""Weights are checked before they are used; what is wrong with a file is said in one line."""
+"""Check that weights are validated before use, and that the fault of a file is one line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from topoloc_training.weights import find_weights, load_features, read_weights
 
 
 def netvlad_tensors(num_clusters: int = 64) -> dict[str, torch.Tensor]:
-    """The keys and shapes of the public NetVLAD of VGG-16, small numbers in them."""
+    """Return small values under the keys and shapes of the public NetVLAD of VGG-16."""
     with torch.device("meta"):
         features = Backbone("vgg16", num_outputs=None).state_dict()
     tensors = {

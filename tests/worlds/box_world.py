@@ -1,5 +1,5 @@
-"""A world small enough for tests: one room with pictures on its walls, a lamp, and a pillar to walk
-around."""
+"""Define a world small enough for tests: one room with pictures on its walls, a lamp, and a pillar
+in the middle."""
 
 from __future__ import annotations
 

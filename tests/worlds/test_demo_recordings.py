@@ -1,5 +1,5 @@
-"""The demo's recordings: rendered in their order, resumed where they were left, and pictures of
-nothing that are just that."""
+"""Test the demo's recordings: rendered in order, resumed after a stop, and images
+without content."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_who_asks_walks_otherwise_than_who_mapped():
-    """No query may be a mapping frame once more."""
+    """No query image may repeat a mapping frame."""
     lab = find_world("lab")
     walks = {
         r.name: frame_poses(plan_route(lab.loop, lab.camera_height, r.config.route))

@@ -42,7 +42,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of the test room; not to be written to."""
+    """Return a recording of the test room. Read-only."""
     out = tmp_path_factory.mktemp("recorded") / "box"
     result = record(BOX_WORLD, DAY, out, CONFIG)
     assert (result.num_frames, result.num_rendered) == (4, 4)
@@ -112,8 +112,8 @@ def test_other_settings_need_another_folder(recorded: Path, tmp_path: Path):
 
 
 def test_truth_agrees_with_the_rendered_geometry(recorded: Path):
-    """Points of one frame's depth, moved by truth.tum, are where another frame's depth has them: to
-    a tenth of a pixel."""
+    """Points of one frame's depth, moved by truth.tum, match another frame's depth to a
+    tenth of a pixel."""
     poses = open_sequence(recorded).poses
     depths = [
         cv2.imread(str(recorded / "depth_2" / f"{i:06d}.png"), cv2.IMREAD_UNCHANGED) / 5000.0

@@ -18,8 +18,8 @@ QUIET = SensorConfig(full_well=1e12, read_noise=0.0, white_balance_error=0.0, vi
 
 
 class StripedWall(Renderer):
-    """A wall 2 m before the camera wherever it goes, with upright stripes fixed to the world's y
-    axis; no Mitsuba."""
+    """Render a wall 2 m in front of any camera, with upright stripes fixed to the world's y axis,
+    without Mitsuba."""
 
     def __init__(self, brightness: float = 1.0) -> None:
         self.brightness = brightness

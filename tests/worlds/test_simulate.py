@@ -20,7 +20,7 @@ Complaint = Callable[..., str]
 
 @pytest.fixture
 def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Grey pictures instead of rendered ones, so that the command alone is tested."""
+    """Replace rendered images by grey ones, so that only the command is tested."""
 
     def grey(shooting: shots.Shooting | None, index: int) -> Shot:
         assert index < 1000

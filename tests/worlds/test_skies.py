@@ -10,7 +10,7 @@ from topoloc_worlds.skies import sky_of
 
 
 def directions(sky: Sky) -> Float64[np.ndarray, "h w 3"]:
-    """By the words of `Sky.radiance`, independently of the code that makes it."""
+    """Compute the directions from the description of `Sky.radiance`, independently of its code."""
     height, width, _ = sky.radiance.shape
     polar, azimuth = np.meshgrid(
         (np.arange(height) + 0.5) / height * np.pi,

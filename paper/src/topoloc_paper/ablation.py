@@ -1,5 +1,7 @@
-"""Where an error comes from: one part at a time is given the truth, made better, or made the
-paper's."""
+"""Measure how much each part of the method contributes to the error.
+
+One part at a time is replaced by ground truth, by a better version, or by the paper's version.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ UNGUIDED = replace(SURF_ALONE, guided=GuidedConfig(num_nodes=0))
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
-    """A row for each recording and each part that is changed; surf-vlad finds the nodes where they
-    are not given."""
+    """Return a row for each recording and each replaced part. Nodes come from surf-vlad or from
+    ground truth."""
     return [
         row
         for dataset in datasets
@@ -31,8 +33,7 @@ def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
 
 
 def ways_of(dataset: Dataset) -> dict[str, tuple[str, Way]]:
-    """What is changed -> (the part of the method that it belongs to, how the queries are then
-    answered)."""
+    """Return the replaced part -> (the stage that it belongs to, the settings of the queries)."""
     paper = MapKind.as_paper(dataset)
     return {
         "as it is": ("", Way(paper)),

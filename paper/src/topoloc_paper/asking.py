@@ -1,5 +1,4 @@
-"""Queries asked, once: every way of answering gives the rows that all tables and figures are made
-of."""
+"""Localize each query once, and store the rows from which all tables and figures are made."""
 
 from __future__ import annotations
 
@@ -25,8 +24,8 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Way:
-    """A way of answering: the map, the coarse localizer, the fine step. `knows_node` puts the truth
-    in the coarse one's place."""
+    """Hold the settings of a query run: the map, the coarse localizer, the fine step. `knows_node`
+    replaces the coarse localizer by ground truth."""
 
     kind: MapKind
     coarse: str = "surf-vlad"
@@ -43,15 +42,15 @@ class Way:
 
     @property
     def code(self) -> StageCode:
-        """What its answers follow from."""
+        """Return the code on which the answers depend."""
         return asking(self.coarse, *(("topoloc_paper/known_nodes.py",) if self.knows_node else ()))
 
 
 def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
-    """Rows (`stored_answers`) of every query of one recording.
+    """Localize every query of one recording and return the rows (`stored_answers`).
 
     Raises:
-        What `opened` and `localize_queries` raise.
+        TopolocError: see `opened` and `localize_queries`.
     """
     topomap, digest = opened(bench, dataset, way.kind, way.coarse)
     sequence = queries_of(bench, dataset, label)
@@ -94,7 +93,7 @@ def answers(bench: Bench, dataset: Dataset, label: str, way: Way) -> list[Evalua
 
 
 def summary(bench: Bench, dataset: Dataset, label: str, way: Way) -> dict[str, Any]:
-    """What `summarize` says of the answers."""
+    """Return the summary (`summarize`) of the answers."""
     return summarize(answers_of(asked(bench, dataset, label, way).result, label))
 
 

@@ -39,7 +39,7 @@ _WORLDS = ("lab", "corridor", "street")
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc benchmark` takes."""
+    """Hold the arguments of `topoloc benchmark`."""
 
     part: Annotated[tyro.conf.Positional[Part], tyro.conf.arg(metavar="PART")] = "paper"
     """paper: everything; or a part: conditions, nodes, speed, peers, recordings (real ones)."""
@@ -154,7 +154,7 @@ class Command:
         )
 
     def _words(self) -> str:
-        """What was called, without where things lie."""
+        """Return the command without the paths of files."""
         words = ["topoloc benchmark", self.part] + [
             f"--{name}" for name in ("quick", "draft") if getattr(self, name)
         ]

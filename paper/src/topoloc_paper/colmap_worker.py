@@ -1,7 +1,7 @@
-"""What `peer_colmap.py` has pycolmap do, in a process that loads nothing else of weight: ``python
--m ... FOLDER``.
+"""Run pycolmap for `peer_colmap.py` in a process of its own: ``python -m ... FOLDER``.
 
-The folder holds the pictures and `job.json`; `answers.json` is written into it.
+The folder holds the images and `job.json`. `answers.json` is written into it. The process loads no
+other large library.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MIN_POINTS = 4
 
 @dataclass(frozen=True, eq=False)
 class MapImage:
-    """A triangulated picture: row k of `points_world` is NaN where key point k has no 3-D point."""
+    """Hold a triangulated image. Row k of `points_world` is NaN if key point k has no 3-D point."""
 
     name: str
     descriptors: Float32[np.ndarray, "n d"]
@@ -61,7 +61,8 @@ class Worker:
         return time.perf_counter()
 
     def _extract(self, name: str, rows: list[dict[str, Any]]) -> Any:
-        """A database with the features of these pictures, all of one camera where that is so."""
+        """Return a database with the features of these images. Images of equal cameras share one
+        camera."""
         path = self.folder / f"{name}.db"
         for camera in {json.dumps(row["camera"], sort_keys=True) for row in rows}:
             names = [
@@ -192,7 +193,7 @@ def mutual_matches(
 
 
 def _points(model: Any, image_id: int) -> Float[np.ndarray, "n 3"]:
-    """The 3-D point (metres, world) of each key point, NaN where it has none."""
+    """Return the 3-D point (metres, world) of each key point, NaN if it has none."""
     points = model.images[image_id].points2D
     return np.array(
         [model.points3D[p.point3D_id].xyz if p.has_point3D() else [np.nan] * 3 for p in points]

@@ -1,8 +1,8 @@
-"""The places of the benchmark: which recordings map them, which ask, and how the paper discretises
-them.
+"""Define the places of the benchmark: mapping recordings, query recordings, node placement.
 
-Three kinds: the rendered counterparts of the paper's three (street for CARLA, corridor, lab), real
-recordings where a folder with them is named, and, for the quick run, what topoloc brings along.
+There are three kinds of places: rendered counterparts of the paper's three (street for CARLA,
+corridor, lab), real recordings if a folder with them is given, and for the quick run the recordings
+that ship with topoloc.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class PaperRecording:
 
     @property
     def words(self) -> str:
-        """What follows `topoloc simulate`."""
+        """Return the arguments of `topoloc simulate`."""
         words = [self.world, self.name]
         words += ["--condition", self.condition] if self.condition != "day" else []
         words += ["--laps", f"{self.laps:g}"] if self.laps != 1.0 else []
@@ -92,12 +92,12 @@ RENDERED = (
 
 @dataclass(frozen=True)
 class Dataset:
-    """A place: recordings that map it, recordings that ask (by what they are called), and Eq. 1 as
-    the paper sets it.
+    """Hold a place: its mapping recordings, its query recordings by label, and the paper's values
+    of Eq. 1.
 
-    `d_thresh` is in metres, `lambda_rot` in metres a radian; `sweep` are the D_thresh that the node
-    sweep tries. `map_from_truth` names a JSON file with the 4x4 matrix that takes the queries'
-    world into the map's.
+    `d_thresh` is in metres, `lambda_rot` in metres a radian. `sweep` holds the D_thresh that the
+    node sweep tries. `map_from_truth` names a JSON file with a 4x4 matrix, which transforms the
+    world of the queries into that of the map.
     """
 
     name: str
@@ -248,7 +248,7 @@ def is_complete(recording: PaperRecording, folder: Path, draft: bool) -> bool:
 
 
 def render_missing(folder: Path, names: Sequence[str], draft: bool, progress: Progress) -> None:
-    """Render what is not complete yet of the recordings `names`; what is complete is not touched.
+    """Render the incomplete recordings among `names`. Complete ones stay as they are.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.
@@ -271,8 +271,7 @@ def render_missing(folder: Path, names: Sequence[str], draft: bool, progress: Pr
 def at_hand(
     datasets: Sequence[Dataset], folder: Path, draft: bool
 ) -> tuple[list[Dataset], list[str]]:
-    """The rendered data sets less what is not complete, and the names of the recordings that are
-    missing."""
+    """Return the rendered data sets without incomplete recordings, and the names of these."""
     missing = [
         recording.name
         for recording in RENDERED

@@ -22,8 +22,11 @@ METHOD_COLOURS: dict[str, str] = dict(
 
 
 def draw_topological_accuracy(rows: Sequence[Row]) -> Figure:
-    """The paper's figure of topological accuracy: for each recording the share of queries whose
-    nearest node was named first, and above it, paler, a neighbour of it."""
+    """Draw the paper's figure of topological accuracy.
+
+    A bar shows, for each recording, the share of queries whose nearest node was ranked first. The
+    paler bar above it shows the share whose neighbouring node was ranked first.
+    """
     shown = [
         r
         for r in rows
@@ -96,8 +99,8 @@ def draw_node_sweep(rows: Sequence[Row]) -> Figure:
 
 
 def draw_stage_times(rows: Sequence[Row]) -> Figure:
-    """Table III as bars: the stages' medians one after the other, and what the paper took in
-    all."""
+    """Draw Table III as stacked bars of the median times of all stages, beside the paper's
+    total."""
     shown = [r for r in rows if not r.get("missing")]
     stages = {
         "patch_normalization": "patch normalisation",

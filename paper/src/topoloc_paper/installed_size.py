@@ -1,5 +1,5 @@
-"""How many bytes an installation takes: a distribution with all that it needs, by what pip wrote
-down of the files."""
+"""Compute the size of an installation: a distribution with its requirements, from the files that
+pip recorded."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ _NAME = re.compile(r"^[A-Za-z0-9][\w.-]*")
 
 
 def installed_bytes(names: Sequence[str]) -> int | None:
-    """Bytes of these distributions and of what they need, extras left out; None where one of them
-    is not installed."""
+    """Return the bytes of these distributions and their requirements without extras; None if one of
+    them is not installed."""
     found: dict[str, Distribution] = {}
     for name in names:
         try:

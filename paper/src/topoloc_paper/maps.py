@@ -48,7 +48,7 @@ class MapKind:
 
     @staticmethod
     def as_topoloc(normalization: Normalization = "wide") -> MapKind:
-        """What `topoloc build` does by itself."""
+        """Return the default settings of `topoloc build`."""
         return MapKind(None, None, normalization)
 
     @property
@@ -107,11 +107,10 @@ def built(bench: Bench, dataset: Dataset, kind: MapKind) -> Done:
 
 
 def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
-    """The facts of a learned coarse localizer: what it was trained from and for how long. `opened`
-    gives the map with it.
+    """Train a learned coarse localizer, and return its facts: training data and duration.
 
-    It learns from the mapping images and their nodes alone, so it is kept where only the map's
-    points have changed.
+    `opened` returns the map that contains it. The localizer depends on the mapping images and their
+    nodes alone, so it is kept if only the map's points have changed.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -164,8 +163,11 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
 def opened(
     bench: Bench, dataset: Dataset, kind: MapKind, method: str = "surf-vlad"
 ) -> tuple[TopoMetricMap, str]:
-    """The map with this coarse localizer as its default, and what stands for both (`Done.digest`).
-    Raises as `taught` does."""
+    """Return the map with this default coarse localizer, and the digest of both (`Done.digest`).
+
+    Raises:
+        TopolocError: see `taught`.
+    """
     map_done = built(bench, dataset, kind)
     topomap = TopoMetricMap.load(path_of(bench, dataset, kind))
     if method not in LEARNED:
@@ -187,7 +189,7 @@ def _model_path(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> P
 
 
 def images_digest(topomap: TopoMetricMap) -> str:
-    """A short name for what classifiers learn from: the mapping images, their poses and their
+    """Return a digest of a classifier's training data: the mapping images, their poses and their
     nodes."""
     rows = [
         [hashlib.sha256(i.jpeg).hexdigest(), i.node_id, pose_to_json(i.world_from_cam)]
@@ -199,7 +201,7 @@ def images_digest(topomap: TopoMetricMap) -> str:
 
 
 def why_not(bench: Bench, method: str) -> str | None:
-    """What is missing for a method, in words; None where nothing is."""
+    """Return the missing requirement of a method, None if there is none."""
     if method not in (*LEARNED, "posenet"):
         return None
     try:

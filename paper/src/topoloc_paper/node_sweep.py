@@ -12,8 +12,10 @@ from topoloc_paper.settings import Bench
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
-    """A row for each data set and D_thresh, many nodes first: asked is the first recording of each,
-    surf-vlad finds the nodes."""
+    """Return a row for each data set and D_thresh, from many nodes to few.
+
+    Queries are those of the first recording of each data set. surf-vlad finds the nodes.
+    """
     return [
         _row(bench, dataset, d_thresh) for dataset in datasets for d_thresh in sorted(dataset.sweep)
     ]

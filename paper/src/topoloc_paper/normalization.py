@@ -17,8 +17,11 @@ NORMALIZED_FEATURES = LocalizerConfig(kinds=("surf",))
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
-    """Every recording asked of maps without normalisation, with the paper's 17x17 one, and with
-    topoloc's; surf-vlad finds the nodes."""
+    """Query every recording in maps without normalisation, with the paper's 17x17 one, and with
+    topoloc's.
+
+    surf-vlad finds the nodes.
+    """
     return [
         row
         for dataset in datasets

@@ -113,8 +113,11 @@ class _Files:
 
 
 def write_page(bench: Bench, results: Mapping[str, Any]) -> None:
-    """Write `report.html` and the folder `figures`. Raises TopolocError where they cannot be
-    written."""
+    """Write `report.html` and the folder `figures`.
+
+    Raises:
+        TopolocError: a file cannot be written.
+    """
     files = _Files(bench)
     style = page_style() + _STYLE
     sections = [_section("What this is", "", f"<p>{escape(about(results)).replace('`', '')}</p>")]

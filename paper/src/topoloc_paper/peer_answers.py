@@ -1,5 +1,7 @@
-"""What every peer gives: a pose or none for each query, and how long it took; judged as our own
-answers are."""
+"""Define the results of peers: for each query a pose or none, and the time that it took.
+
+They are evaluated as our own results are.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ from topoloc_paper.stored_answers import pose_of, pose_to_json
 
 @dataclass(frozen=True, eq=False)
 class PeerAnswer:
-    """`world_from_cam` is None where the peer gave no pose."""
+    """Hold a pose, None if the peer found none, and the milliseconds that it took."""
 
     world_from_cam: Rigid3 | None
     ms: float
@@ -31,7 +33,7 @@ class Peer(Protocol):
     map_bytes: int
 
     def localize(self, frames: Sequence[StereoFrame]) -> list[PeerAnswer]:
-        """An answer for each frame, of which only the picture and its camera are looked at."""
+        """Return a result for each frame, from its image and camera alone."""
         ...
 
 
@@ -52,8 +54,8 @@ def rows_of(
 
 
 def summarize_peer(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """As `metrics.summarize` counts: medians of what was localized; `far_off` and `accepted` (from
-    elsewhere) are false accepts."""
+    """Summarize as `metrics.summarize` does: medians over localized queries. `far_off` and
+    `accepted` (out-of-map images) count false accepts."""
     asked = [row for row in rows if row["truth"] is not None]
     localized = [
         (pose_of(row["pose"]), pose_of(row["truth"])) for row in asked if row["pose"] is not None

@@ -90,7 +90,8 @@ class Colmap:
         ]
 
     def _write_map(self, folder: Path) -> list[dict[str, Any]]:
-        """Left and, where there is one, right picture of every kept node, with camera and pose."""
+        """Yield the left image of every kept node, and the right one if there is one, with camera
+        and pose."""
         rows = []
         for node_id in self._kept:
             summary = self._topomap.summaries[node_id]
@@ -153,7 +154,7 @@ def query_row(
 
 
 def map_rows(folder: Path, node_id: int, frame: StereoFrame) -> list[dict[str, Any]]:
-    """Write the left and, where there is one, right picture of a node; return their rows."""
+    """Write the left image of a node, and the right one if there is one. Return their rows."""
     assert frame.camera is not None
     assert frame.world_from_cam is not None
     cam_from_world = frame.world_from_cam.inverse()

@@ -1,11 +1,10 @@
-"""The paper's fine step as it is written (section III-B), on OpenCV.
+"""Implement the paper's fine step as written (section III-B), with OpenCV.
 
-The first node alone; patch normalisation in 17x17 windows; OpenCV's SURF where it is built in (it
-is not in the wheels), else its SIFT, with default settings; "a fast nearest neighbour-based
-matcher", FLANN's five KD-trees with Lowe's ratio of 0.7; then `solvePnPRansac` with its default
-settings, whose every answer is believed. Nodes, their 3-D positions' source and the coarse step
-(`surf-vlad`) are the ones of the map that topoloc is asked beside it, so that the fine step is all
-that differs.
+It uses the first node alone and patch normalisation in 17x17 windows. The features are OpenCV's
+SURF if it is built in (wheels lack it), else its SIFT, with default settings. "A fast nearest
+neighbour-based matcher" is FLANN with five KD-trees and Lowe's ratio of 0.7. `solvePnPRansac` runs
+with default settings, and every result is accepted. Nodes, the source of their 3-D positions and
+the coarse step (`surf-vlad`) are those of topoloc's map, so only the fine step differs.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Retrieval alone: the pose of the node that the coarse localizer names first.
+"""Return the pose of the node that the coarse localizer ranks first.
 
-This is what place recognition by itself gives, and what pipelines that never say "not here" fall
-back to (hloc writes the pose of the nearest image where PnP fails). It shows what the fine step
-adds, and answers every query.
+This is place recognition alone, and the fallback of pipelines that never refuse a query (hloc
+writes the pose of the nearest image if PnP fails). It shows the gain of the fine step, and answers
+every query.
 """
 
 from __future__ import annotations

@@ -83,8 +83,8 @@ def _our_rows(bench: Bench, dataset: Dataset, kind: MapKind) -> list[dict[str, A
 
 
 def _peer_rows(bench: Bench, dataset: Dataset, name: str, kind: MapKind) -> list[dict[str, Any]]:
-    """Rows of one peer: all recordings and the images from elsewhere are asked of one map, in one
-    stage."""
+    """Return the rows of one peer. All recordings and out-of-map images are localized in one map,
+    in one stage."""
     map_done = built(bench, dataset, kind)
     queries = {label: queries_of(bench, dataset, label) for label in dataset.queries}
     others = elsewhere_of(bench, dataset)

@@ -42,8 +42,7 @@ def against_posenet(bench: Bench) -> dict[str, Figure]:
 
 
 def conditions(bench: Bench) -> dict[str, Figure]:
-    """Each place as it was mapped and under every condition in which it was asked, seen from about
-    the same poses."""
+    """Draw each place as mapped and under every query condition, from about the same poses."""
     figures = {}
     for dataset in (d for d in bench.rendered if len(d.queries) > 1):
         columns = _same_places(bench, dataset)

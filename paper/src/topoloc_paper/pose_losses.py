@@ -1,4 +1,4 @@
-"""How far a regressed pose is from the true one, as PoseNet's losses say it.
+"""Compute the error of a regressed pose by PoseNet's losses.
 
 Poses are pairs of translations (n, 3), metres, and unit quaternions (n, 4), w first, of
 world_from_cam. A quaternion and its negative are one rotation.

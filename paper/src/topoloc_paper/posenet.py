@@ -107,7 +107,7 @@ class PoseNet:
     training: Training | None = None
 
     def localize(self, images: Sequence[Image]) -> list[Rigid3]:
-        """world_from_cam of each image. PoseNet never says that it does not know."""
+        """Return world_from_cam of each image. PoseNet never refuses an image."""
         pictures = torch.from_numpy(
             prepare_network_images(images, self.picture_shape, self.config.picture)
         )
@@ -236,7 +236,7 @@ def _poses(network: PoseRegressor, pictures: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _seen_points(topomap: TopoMetricMap, node_ids: np.ndarray) -> Float[np.ndarray, "n k 3"]:
-    """Points (metres, world) of each image's node, some of them; repeated where the node has
+    """Return some points (metres, world) of each image's node, with repetitions if the node has
     fewer."""
     rng = np.random.default_rng(0)
     of_node = {}

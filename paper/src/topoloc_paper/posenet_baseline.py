@@ -1,9 +1,9 @@
-"""The paper's baseline: PoseNet, trained on the very mapping images that our classifiers are
-trained on, and asked the same queries.
+"""Train the paper's baseline, PoseNet, on the mapping images of our classifiers, and run the same
+queries.
 
-Kendall, Grimes & Cipolla (2015) and Kendall & Cipolla (2017); `posenet.py` is the network. Each of
-the losses asked for is trained, and the one with the least mean D_total on the images held out is
-asked. It answers every query.
+The method is that of Kendall, Grimes & Cipolla (2015) and Kendall & Cipolla (2017). `posenet.py` is
+the network. Each loss of the settings is trained, and the network with the least mean D_total on
+the held-out images answers every query.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ _CODE = learning("topoloc_paper/posenet.py")
 
 
 def trained(bench: Bench, dataset: Dataset) -> Done:
-    """Which loss did best, and for how long each was trained; the network lies at `_network_path`.
+    """Train the network, and return the best loss and the training times. `_network_path` is its
+    file.
 
     Raises:
-        WeightsError, TrainingError: see `train_posenet`; MissingExtraError where torch is not
-            installed (`why_not` says so before).
+        WeightsError, TrainingError: see `train_posenet`.
+        MissingExtraError: torch is not installed. `why_not` returns this reason in advance.
     """
     kind = MapKind.as_paper(dataset)
     map_done = built(bench, dataset, kind)

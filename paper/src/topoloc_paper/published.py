@@ -79,7 +79,7 @@ TABLE_THREE: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True)
 class Target:
-    """Errors that must be reached: medians at most (metres, degrees; None: not asked for)."""
+    """Hold the largest permitted median errors (metres, degrees; None means no limit)."""
 
     dataset: str
     queries: str

@@ -1,4 +1,4 @@
-"""What a run of the benchmark is asked for, and what its stages share."""
+"""Define the settings of a benchmark run, and the state that its stages share."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ BACKBONE_WORDS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """Files of weights, as far as they are at hand. The paper's networks are used where their file
-    is there, else SqueezeNet; without any file SqueezeNet begins at random."""
+    """Hold the files of weights. Without the paper's networks SqueezeNet is used, with random
+    weights if it has no file."""
 
     squeezenet: str | None = None
     vgg11: str | None = None
@@ -41,7 +41,7 @@ class WeightFiles:
         return "squeezenet1_1", self.squeezenet or "scratch"
 
     def words(self, method: str) -> str:
-        """What a table says of the weights of a method."""
+        """Return a description of a method's weights for tables."""
         if method not in (*LEARNED, "posenet"):
             return "none needed"
         backbone, file = self.choice(method)
@@ -59,21 +59,20 @@ class WeightFiles:
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Settings of the benchmark.
+    """Hold the settings of the benchmark.
 
     Attributes:
-        draft: the recordings are of the renderer's draft quality.
-        quick: the small run on what topoloc brings along.
+        draft: the recordings have the renderer's draft quality.
+        quick: the small run on recordings that ship with topoloc.
         weights: see `WeightFiles`.
-        epochs: times that cnn-fc sees every image, at most.
+        epochs: the largest number of epochs of cnn-fc.
         posenet_epochs: the same of PoseNet, for each of its losses.
-        max_shown: pictures that a training shows in all, about: places with many mapping images get
-            fewer epochs.
-        posenet_losses: the one that does best on held-out images is asked.
-        max_colmap_images: mapping images that pycolmap is given, evenly spread, at most.
-        max_elsewhere: images of other places that each map is asked about, at most, from each of
-            them.
-        max_queries: of each recording, evenly spread; None for all.
+        max_shown: about the largest number of images in all epochs of a training. Places with many
+            mapping images get fewer epochs.
+        posenet_losses: the losses to train. The best on held-out images is used.
+        max_colmap_images: the largest number of mapping images for pycolmap, evenly spread.
+        max_elsewhere: the largest number of queries with images of each other place, for each map.
+        max_queries: the largest number of queries of each recording, evenly spread; None for all.
     """
 
     draft: bool = False
@@ -88,13 +87,13 @@ class PaperConfig:
     max_queries: int | None = None
 
     def with_epochs(self, epochs: int | None, posenet_epochs: int | None) -> PaperConfig:
-        """The same with these numbers of epochs, where they are given."""
+        """Return these settings with other numbers of epochs. None keeps a number."""
         return replace(
             self, epochs=epochs or self.epochs, posenet_epochs=posenet_epochs or self.posenet_epochs
         )
 
     def training(self, epochs: int, num_images: int) -> TrainingConfig:
-        """At most so many epochs, fewer where there are many images."""
+        """Return the training settings with at most `epochs` epochs, fewer for many images."""
         epochs = max(min(epochs, self.max_shown // max(num_images, 1)), 1)
         return TrainingConfig(max_epochs=epochs, patience=max(epochs // 3, 3))
 
@@ -113,9 +112,9 @@ class PaperConfig:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A run: its settings, its places, where stages and maps are kept, and how progress is told.
+    """Hold a run: settings, places, folders of stages and maps, and the progress callback.
 
-    `command` is what was called, for the tables; `missing` are the recordings that are not there.
+    `command` is the command line, for the tables. `missing` holds the names of missing recordings.
     """
 
     config: PaperConfig
@@ -128,7 +127,7 @@ class Bench:
     missing: Sequence[str] = ()
 
     def folder(self, name: str) -> Path:
-        """A folder of the run, made where it is not there yet."""
+        """Return a folder of the run. It is made if it does not exist."""
         folder = self.out / name
         folder.mkdir(parents=True, exist_ok=True)
         return folder

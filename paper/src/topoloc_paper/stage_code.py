@@ -1,9 +1,8 @@
-"""The code that a stage's result follows from: its own modules and all that these import, as far as
-it can change the result.
+"""Find the code on which a stage's result depends: its own modules and their imports.
 
-Comments and docstrings do not count, nor do modules whose results the stage's settings name
-already. So a change of localization alone asks all queries again, but builds no map, teaches no
-network and calls no peer. What is imported at run time, by a name in a string, is listed here.
+Comments and docstrings do not count, nor do modules whose results are in the stage's settings. So a
+change of localization alone repeats all queries, but builds no map, trains no network and runs no
+peer. Modules that are imported at run time, by a name in a string, are listed here.
 """
 
 from __future__ import annotations
@@ -85,7 +84,8 @@ def asking(coarse: str, *others: str) -> StageCode:
 
 
 def answering(*modules: str) -> StageCode:
-    """A peer, which may ask the map's own coarse localizer but not topoloc's fine step."""
+    """Return the code of a peer. It may use the map's coarse localizer but not topoloc's fine
+    step."""
     return StageCode(
         (*modules, COARSE_MODULES["surf-vlad"], _READING), (*_COUNTING, "topoloc/localization")
     )
@@ -128,14 +128,13 @@ def _file(module: str) -> Path:
 
 @cache
 def _meaning(module: str) -> str:
-    """A digest of what a module does, however it is written down."""
+    """Return a digest of a module's behaviour, independent of its formatting."""
     tree = _Running().visit(ast.parse(_file(module).read_bytes()))
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
 class _Running(ast.NodeTransformer):
-    """Leaves out what does nothing when a program runs: docstrings, and imports for the type
-    checker."""
+    """Remove nodes without effect at run time: docstrings, and imports for the type checker."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         return (

@@ -22,17 +22,17 @@ STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp", "total
 
 
 def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
-    """A row for each data set and coarse localizer: median and quartiles (seconds) of every stage,
-    over the first recording.
+    """Return a row for each data set and coarse localizer: median and quartiles (seconds) of every
+    stage.
 
-    Each picture is put to all of them in turn, so that whatever else the machine does slows all
-    alike; "load" is what it had to do.
+    The first recording is measured. All localizers take turns on each image, so other work of the
+    machine slows all alike. "load" is the load average of the machine.
     """
     return [row for dataset in datasets for row in _rows(bench, dataset)]
 
 
 def machine() -> dict[str, Any]:
-    """What the times were taken on."""
+    """Describe the machine on which the times were measured."""
     model = next(
         (line.partition(":")[2].strip() for line in _cpu_lines() if line.startswith("model name")),
         platform.processor(),

@@ -1,9 +1,8 @@
-"""Stages whose results are kept: a run that was interrupted, or is asked again, goes on from what
-is there.
+"""Store the results of stages, so that an interrupted or repeated run continues from them.
 
-A stage is one JSON file, written when it is done, with all that its result follows from: its
-settings (which name the stages that it builds on) and the code that it runs (`stage_code.py`).
-Where either has changed it is done again.
+A stage is one JSON file, written at its end. It holds all on which the result depends: its settings
+(which name the stages before it) and its code (`stage_code.py`). If either has changed, the stage
+runs again.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from topoloc_paper.stage_code import StageCode
 
 @dataclass(frozen=True)
 class Done:
-    """A stage's result; `digest` stands for all that it follows from; `seconds` is what it took
-    when it was done."""
+    """Hold the result of a stage. `digest` identifies all on which it depends. `seconds` is its run
+    time."""
 
     result: Any
     digest: str
@@ -53,11 +52,14 @@ class StageStore:
         code: StageCode,
         files: Sequence[Path] = (),
     ) -> Done:
-        """The result of the stage `name`: the kept one if it follows from the same, else that of
-        `compute`, as JSON gives it back.
+        """Return the stored result of the stage `name` if its origin is equal, else the result of
+        `compute`.
+
+        Results pass through JSON.
 
         Args:
-            files: what the stage writes beside its result; where one is missing it is done again.
+            files: files that the stage writes beside its result. If one is missing, the stage runs
+                again.
         """
         path = self.folder / f"{name}.json"
         origin = json.loads(json.dumps({"settings": settings, "code": code.digest()}))
@@ -85,7 +87,7 @@ def digest_of(value: Any) -> str:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """A kept stage; None where there is none, or none that can be read."""
+    """Return a stored stage, None if there is none or if it cannot be read."""
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Answers as JSON and back, so that tables and figures can be made of them without asking again."""
+"""Convert results to JSON and back, so that tables and figures need no new queries."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ def rows_of(answers: Sequence[EvaluatedQuery]) -> list[dict[str, Any]]:
 def answers_of(
     rows: Sequence[dict[str, Any]], recording: str, sequence: StereoSequence | None = None
 ) -> list[EvaluatedQuery]:
-    """The inverse of `rows_of`; pictures and cameras are read again from `sequence` when they are
-    asked for."""
+    """Return the inverse of `rows_of`. Images and cameras are read lazily from `sequence`."""
     cameras = _Pictures(sequence) if sequence is not None else None
     return [_answer_of(row, recording, cameras) for row in rows]
 

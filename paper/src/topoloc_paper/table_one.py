@@ -1,5 +1,8 @@
-"""Tables I and II: PoseNet and every coarse localizer on every recording, by the paper's D_thresh,
-beside what the paper printed."""
+"""Make Tables I and II: PoseNet and every coarse localizer on every recording, beside the paper's
+figures.
+
+Nodes are placed by the paper's D_thresh.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ def all_rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
 
 
 def published_for(dataset: str, label: str, method: str) -> MedianErrors | None:
-    """What the paper printed for the like, if it did."""
+    """Return the paper's figure for the same case, None if it has none."""
     if dataset == "street" and label in ("cloudy", "rain"):
         return TABLE_TWO[label].get(method)
     return (

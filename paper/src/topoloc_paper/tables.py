@@ -28,11 +28,11 @@ TABLES: dict[Part, tuple[str, ...]] = {
 
 
 def tables_of(bench: Bench, part: Part) -> dict[str, Any]:
-    """The tables that the part is about; `recordings` takes the real recordings alone, all others
-    but `paper` the rendered ones.
+    """Compute the tables of a part. `recordings` uses real recordings alone, all others but `paper`
+    and `peers` rendered ones alone.
 
     Raises:
-        TopolocError: a stage could not be done; what was done before is kept.
+        TopolocError: a stage failed. The results of earlier stages are kept.
     """
     rendered, real = list(bench.rendered), list(bench.real)
     datasets = (

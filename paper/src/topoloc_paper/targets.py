@@ -13,8 +13,8 @@ def rows(
     ablation: Sequence[dict[str, Any]],
     speed: Sequence[dict[str, Any]],
 ) -> list[dict[str, Any]]:
-    """A row for each target that was measured: the best of the methods by the paper's D_thresh,
-    topoloc's own nodes, what would help."""
+    """Return a row for each measured target: the best method by the paper's D_thresh, topoloc's own
+    nodes, and the change that would help."""
     found = []
     for target in TARGETS:
         asked = [
@@ -85,7 +85,7 @@ def _reaches(row: dict[str, Any], target: Target) -> bool:
 
 
 def _what_helps(ablation: list[dict[str, Any]]) -> str:
-    """The change that lowers the error most, in words; nothing where none does by a tenth."""
+    """Describe the change that lowers the error most, if one lowers it by a tenth."""
     plain = next((r for r in ablation if not r["part"]), None)
     if plain is None or plain["median_translation_m"] is None:
         return ""

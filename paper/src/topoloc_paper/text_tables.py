@@ -25,7 +25,7 @@ def markdown_of(results: Mapping[str, Any]) -> str:
 
 
 def about(results: Mapping[str, Any]) -> str:
-    """What was run, on what, with which weights."""
+    """Describe the command, the machine and the weights of a run."""
     s, m = results["settings"], results["machine"]
     of_words: dict[str, list[str]] = {}
     for method, words in s["weights"].items():
@@ -65,7 +65,8 @@ class Table:
         return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
     def html(self) -> str:
-        """With the report's style sheet; where the first cell is the one above it is left empty."""
+        """Return HTML for the report's style sheet. A first cell equal to the one above is left
+        empty."""
         head = "".join(f"<th>{escape(column)}</th>" for column in self.columns)
         body, above = "", ""
         for first, *rest in self.lines:
@@ -98,7 +99,7 @@ def error_words(row: Row) -> str:
 
 
 def paper_words(row: Row) -> str:
-    """What the paper printed for the like."""
+    """Return the paper's figure for the same case."""
     return (
         MISSING
         if row.get("paper_m") is None

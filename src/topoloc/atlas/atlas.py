@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import os
+import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,51 +13,17 @@ from typing import Any, TypeVar
 
 from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
-from topoloc.atlas.manifest import Manifest, Tile
-from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
+from topoloc.atlas.joint_worlds import Join
+from topoloc.atlas.manifest import Manifest, StoredFile, Tile
+from topoloc.atlas.store import MANIFEST, Store, find_store, read_manifest, sha256_of, store_at
 from topoloc.atlas.tile_facts import find_other_facts
-from topoloc.errors import AtlasError, MapError
+from topoloc.errors import AtlasError, MapError, TopolocError
 from topoloc.json_data import OneLine
 from topoloc.mapping.edit import read_history
+from topoloc.mapping.storage.kept_files import kept_path
+from topoloc.recordings.atomic import temporary_folder
 
-_OBJECT_STORES = "topoloc.apps.stores.object_store"
-"""Module of `ObjectStore`. It is imported by name, because obstore is an optional extra and the
-module belongs to the apps."""
 T = TypeVar("T")
-
-
-def store_at(where: str) -> Store:
-    """Return the store of an atlas: a folder, or an object store if the address contains `://`.
-
-    Raises:
-        AtlasError: the store cannot be opened.
-        MissingExtraError: the extra for object stores is not installed.
-    """
-    if "://" in where:
-        return importlib.import_module(_OBJECT_STORES).ObjectStore(where)
-    return FolderStore(Path(where))
-
-
-def read_manifest(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
-    """Return the manifest of a store, as bytes and parsed. If there is none and `creates` is set,
-    it is an empty one.
-
-    Raises:
-        AtlasError: there is no atlas, or it is damaged.
-    """
-    data = store.manifest()
-    if data is not None:
-        return data, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
-    if creates:
-        return None, Manifest()
-    raise AtlasError(
-        f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one"
-    )
-
-
-def absolute_address(where: str) -> str:
-    """Return the address of an atlas as an absolute path, or unchanged for an object store."""
-    return where if "://" in where else os.path.abspath(where)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -154,11 +121,37 @@ class Atlas(OneLine):
 
     @staticmethod
     def merge(sources: Sequence[str], where: str) -> Atlas:
-        """Create an atlas of the tiles of all sources, atlases or map files, with their joins.
-        Raises AtlasError, MapError."""
-        from topoloc.atlas.place import merge_atlases
+        """Create an atlas of the tiles of all sources, atlases or map files, with their joins. A
+        map with the same id in two sources becomes one tile. Worlds of different sources stay
+        distinct, even if they have the same name.
 
-        return Atlas(store_at(where), merge_atlases(sources, where))
+        Raises AtlasError if there is an atlas already, two tiles of one id hold different maps, a
+        tile's file is missing or wrong, or the atlas cannot be written. Raises MapError if a map is
+        missing, damaged or empty.
+        """
+        from topoloc.atlas import editing
+
+        store = store_at(where)
+        if store.manifest() is not None:
+            raise AtlasError(f"{where} is an atlas already; a merged one is new")
+        tiles, joins = dict[str, Tile](), list[Join]()
+        with editing.removing_new_files_on_failure(store) as put:
+            for source in sources:
+                if (of_source := find_store(source)) is None:
+                    (new,) = editing.new_tiles([source])
+                    added = {new.tile_id: editing.store_tile(new, put)}
+                    editing.check_same_maps(source, tiles, added)
+                else:
+                    atlas = Atlas(of_source, read_manifest(of_source)[1])
+                    added = atlas.manifest.by_id
+                    editing.check_same_maps(source, tiles, added)
+                    atlas._copy_files(put)
+                    joins += atlas.manifest.joins
+                tiles = editing.with_unique_worlds(tiles, added) | tiles
+            after = Manifest().with_tiles(tiles, time.time(), joins)
+            if not store.commit(None, after.to_bytes()):
+                raise AtlasError(f"{where} became an atlas meanwhile; it stays as it is")
+        return Atlas(store, after)
 
     def __reduce__(self) -> Any:
         return Atlas.from_manifest, (self.address, self.manifest.to_bytes())
@@ -171,7 +164,8 @@ class Atlas(OneLine):
     @property
     def address(self) -> str:
         """Its address from any working directory."""
-        return absolute_address(self.store.where)
+        where = self.store.where
+        return where if "://" in where else os.path.abspath(where)
 
     @property
     def name(self) -> str:
@@ -188,10 +182,59 @@ class Atlas(OneLine):
         return f"{self.store.where}, tile {tile_id}"
 
     def edit(self, tile_id: str, edit: Callable[[Path], T]) -> T:
-        """Edit the map of a tile and return the result of `edit`. Raises as `edit_tile`."""
-        from topoloc.atlas.place import edit_tile
+        """Edit the map of a tile in the newest version of the atlas, and return the result of
+        `edit`. The tile keeps its world and its joins.
 
-        return edit_tile(self.store.where, tile_id, edit)
+        `edit` is a function that edits the map file at a path, as `mapping/edit.py` does. It
+        receives a copy, with the file before the last edit kept beside it. It is called again if
+        another writer replaced the tile in the meantime. Its errors leave the atlas unchanged.
+
+        Raises AtlasError if there is no such atlas or tile, it cannot be read or written, or other
+        writers replaced the tile in each of five tries.
+        """
+        from topoloc.atlas.editing import NewTile, replace_tile
+
+        where, max_tries = self.store.where, 5
+        for _ in range(max_tries):
+            atlas = Atlas.open(where)
+            before = atlas.tile(tile_id)
+            with temporary_folder("topoloc-tile-") as folder:
+                path = folder / f"{tile_id}.topo"
+                atlas._copy_map(before.map, path)
+                for last in before.previous[:1]:
+                    atlas._copy_map(last, kept_path(path, before.map.sha256, last.sha256))
+                try:
+                    done = edit(path)
+                except TopolocError as error:  # the message names the tile instead of the copy
+                    text = str(error).replace(str(path), self.title(tile_id))
+                    error.args = (text, *error.args[1:])
+                    raise
+                if sha256_of(path) == before.map.sha256:
+                    return done
+                new = NewTile(tile_id, path, before.world, before.recipe, before.previous[1:])
+                if replace_tile(where, new, before) is not None:
+                    return done
+        raise AtlasError(
+            f"{where}: tile {tile_id} was replaced by others {max_tries} times meanwhile; it stays"
+            " as they left it"
+        )
+
+    def _copy_map(self, stored: StoredFile, path: Path) -> None:
+        with AtlasError.at(f"cannot copy {stored.name} of {self.store.where}", OSError):
+            shutil.copyfile(self.store.local_path(stored.name, stored.sha256), path)
+        if sha256_of(path) != stored.sha256:
+            raise AtlasError(
+                f"{stored.name} of {self.store.where} is not the file that was added: its checksum"
+                " is another"
+            )
+
+    def _copy_files(self, put: Callable[[str, Path], None]) -> None:
+        """Copy the files of all tiles by `put`. Raises AtlasError if one is missing or wrong."""
+        for tile in self.manifest.tiles:
+            if (problem := self.find_problem(tile.tile_id)) is not None:
+                raise AtlasError(f"tile {tile.tile_id} of {self.store.where}: {problem}")
+            for stored in tile.files:
+                put(stored.name, self.store.local_path(stored.name, stored.sha256))
 
     def report(self, facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
         """Return facts of tiles, by id, as one JSON object."""

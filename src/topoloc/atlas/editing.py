@@ -16,14 +16,13 @@ from pathlib import Path
 
 from msgspec import structs
 
-from topoloc.atlas.atlas import read_manifest, store_at
 from topoloc.atlas.index import compute_global_descriptors, save_global_descriptors
-from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile, check_tile_id
-from topoloc.atlas.store import Store, sha256_of
+from topoloc.atlas.store import Store, read_manifest, sha256_of, store_at
 from topoloc.atlas.tile_facts import map_facts
 from topoloc.errors import AtlasError, EmptyMapError
-from topoloc.mapping.edit import find_kept_files, select_kept
+from topoloc.mapping.storage.kept_files import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_file
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
@@ -288,3 +287,32 @@ def _commit_change(
                     store.remove(name)
             return after
     raise AtlasError(f"{store.where}: other writers came in between {_MAX_TRIES} times")
+
+
+def check_same_maps(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile]) -> None:
+    """Check that tiles with one id hold the same map. Raises AtlasError."""
+    for tile_id in known.keys() & added.keys():
+        if known[tile_id].map.sha256 != added[tile_id].map.sha256:
+            raise AtlasError(
+                f"{source} has a tile {tile_id} too, of another map; `topoloc atlas add --id` gives"
+                " a map another id"
+            )
+
+
+def with_unique_worlds(known: Mapping[str, Tile], added: Mapping[str, Tile]) -> dict[str, Tile]:
+    """Rename the worlds of added tiles so that they differ from the known ones.
+
+    A world with a tile in both is the same world and gets the known name.
+    """
+    same = {added[tile_id].world: known[tile_id].world for tile_id in known.keys() & added.keys()}
+    taken = {tile.world for tile in known.values()}
+    names = dict[str, str]()
+    for world in sorted({tile.world for tile in added.values()}):
+        number, name = 2, same.get(world, world)
+        while world not in same and name in taken:
+            number, name = number + 1, f"{world[:90]}-{number}"
+        taken.add(name)
+        names[world] = name
+    return {
+        tile_id: structs.replace(tile, world=names[tile.world]) for tile_id, tile in added.items()
+    }

@@ -20,8 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from msgspec import Meta, Struct
 
-from topoloc.atlas.joins import ID, Join, JointPose, TileId, check_join
-from topoloc.atlas.joint_worlds import place_tiles
+from topoloc.atlas.joint_worlds import ID, Join, JointPose, TileId, check_join, place_tiles
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -59,7 +58,7 @@ class Tile(OneLine, Struct, frozen=True, eq=False, omit_defaults=True, rename={"
             tile's id.
         georeference: georeference of the map, None if it has none.
         geo_box: minimum latitude and longitude, then the maximum ones, degrees. None if unknown.
-        joint: pose of the world in its joint world (`joins.py`), None if there is none.
+        joint: pose of the world in its joint world (`joint_worlds.py`), None if there is none.
         atlas_from_world: transform from the map's world to the atlas world. It may come from other
             tiles. None if unknown.
         recipe: digest of the recording and settings, if the map was built for this atlas.

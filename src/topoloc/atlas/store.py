@@ -8,6 +8,7 @@ the new manifest, never a part.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
 import shutil
 import time
@@ -16,13 +17,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from topoloc.atlas.manifest import TILES
+from topoloc.atlas.manifest import TILES, Manifest
 from topoloc.errors import AtlasError, TopolocError
 from topoloc.recordings.atomic import atomic_write, remove_all_stale_files, write_bytes
 from topoloc.recordings.file_locks import close, open_to_lock, wait_for_lock
 
 MANIFEST = "atlas.json"
 _LOCK = ".atlas.lock"
+_OBJECT_STORES = "topoloc.apps.stores.object_store"
+"""Module of `ObjectStore`. It is imported by name, because obstore is an optional extra and the
+module belongs to the apps."""
 
 
 @runtime_checkable
@@ -182,6 +186,42 @@ class FolderStore:
             yield
         finally:
             close(descriptor)
+
+
+def store_at(where: str) -> Store:
+    """Return the store of an atlas: a folder, or an object store if the address contains `://`.
+
+    Raises:
+        AtlasError: the store cannot be opened.
+        MissingExtraError: the extra for object stores is not installed.
+    """
+    if "://" in where:
+        return importlib.import_module(_OBJECT_STORES).ObjectStore(where)
+    return FolderStore(Path(where))
+
+
+def find_store(where: str) -> Store | None:
+    """Return the store of the atlas in a folder or an object store. None for any other path, which
+    is a map file. Raises as `store_at`."""
+    is_folder = "://" not in where and os.path.isfile(Path(where) / MANIFEST)
+    return store_at(where) if is_folder or "://" in where else None
+
+
+def read_manifest(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
+    """Return the manifest of a store, as bytes and parsed. If there is none and `creates` is set,
+    it is an empty one.
+
+    Raises:
+        AtlasError: there is no atlas, or it is damaged.
+    """
+    data = store.manifest()
+    if data is not None:
+        return data, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
+    if creates:
+        return None, Manifest()
+    raise AtlasError(
+        f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one"
+    )
 
 
 def file_stamp(path: Path) -> tuple[int, int, int] | None:

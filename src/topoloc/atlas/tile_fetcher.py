@@ -15,8 +15,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from topoloc.atlas.atlas import Atlas, store_at
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
+from topoloc.atlas.store import store_at
 from topoloc.errors import AtlasError, ObjectStoreError
 
 _MAX_CONCURRENT_FETCHES = 16

@@ -18,9 +18,8 @@ from msgspec import structs
 
 from topoloc.errors import CalibrationError, MapError, TrajectoryError
 from topoloc.evaluation.certified_answers import CertifiedAnswers, derive_certificate, find_pieces
-from topoloc.evaluation.metrics import EvaluatedQuery
+from topoloc.evaluation.metrics import EvaluatedQuery, fit_worlds
 from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
-from topoloc.evaluation.world_alignment import fit_worlds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine

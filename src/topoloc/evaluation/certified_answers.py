@@ -31,7 +31,7 @@ from topoloc.localization.result import Localization
 from topoloc.mapping.certificate import Certificate, CertifiedCondition, ConditionKind
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.sessions import today
+from topoloc.mapping.storage.entries import today
 from topoloc.recordings.frame import to_grey
 
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.25, 2.0

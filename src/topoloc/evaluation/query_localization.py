@@ -11,8 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import CalibrationError, TrajectoryError
-from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording, summarize
-from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
+from topoloc.evaluation.metrics import (
+    EvaluatedQuery,
+    WorldFit,
+    fit_worlds,
+    group_by_recording,
+    summarize,
+)
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
 from topoloc.localization.image_calibration_check import check_camera_calibrations

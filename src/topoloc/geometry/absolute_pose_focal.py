@@ -24,8 +24,7 @@ from topoloc.geometry.absolute_pose import (
     select_inliers,
 )
 from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky, squared_errors
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import cells_of
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
@@ -41,9 +40,14 @@ from topoloc.geometry.joint_camera.joint_fit import (
     weigh_cameras,
     weigh_poses,
 )
-from topoloc.geometry.pose_matches import CAUCHY_SCALE, Matches, is_non_collinear, refine_pose
+from topoloc.geometry.pose_matches import (
+    CAUCHY_SCALE,
+    Matches,
+    cells_of,
+    is_non_collinear,
+    refine_pose,
+)
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 
 _FiniteMatches = tuple[
     Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]

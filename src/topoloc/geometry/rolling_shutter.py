@@ -16,10 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import cells_of
 from topoloc.geometry.joint_camera.camera_hypotheses import unchanged_camera
 from topoloc.geometry.joint_camera.joint_fit import Observations, clustered_noise
-from topoloc.geometry.pose_matches import CAUCHY_SCALE, estimate_noise_scale
+from topoloc.geometry.pose_matches import CAUCHY_SCALE, cells_of, estimate_noise_scale
 from topoloc.geometry.rigid import Rigid3
 
 _ROTATION_SIGMA = math.radians(1.5)  # of one axis, during a frame: a hand turns 50 deg/s and more

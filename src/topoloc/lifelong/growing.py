@@ -35,8 +35,8 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import carry_over_error_shares, with_map_statistics
 from topoloc.localization.result import Localization
 from topoloc.mapping import build
-from topoloc.mapping.edit import save_map
 from topoloc.mapping.mapping_frames import create_session, select_posed_frames
+from topoloc.mapping.storage.map_writing import save_map
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
 from topoloc.slam.slam import run_slam

@@ -1,8 +1,8 @@
 """Choose the images of a session that can teach a map another light, and measure whether they do.
 
 The map recognises little of an image in another light, although it knows the surfaces. Such images
-become nodes, whose landmarks have the depths of the map (`map_depth.py`) and the descriptors of the
-new light. They stay only if the images recognise more of each other than of the map.
+become nodes, whose landmarks have the depths of the map (`session_content.py`) and the descriptors
+of the new light. They stay only if the images recognise more of each other than of the map.
 """
 
 from __future__ import annotations

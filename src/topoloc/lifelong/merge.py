@@ -23,12 +23,11 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.config import Progress
 from topoloc.mapping.edit import WaitCallback
+from topoloc.mapping.node_drafts import add_virtual_nodes
 from topoloc.mapping.nodes import node_distances
-from topoloc.mapping.sessions import Edit, today
-from topoloc.mapping.storage.entries import overlay
+from topoloc.mapping.storage.entries import Edit, overlay, today
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
-from topoloc.mapping.virtual_nodes import add_virtual_nodes
 from topoloc.node_ids import NodeId, Row, as_rows
 
 

@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from topoloc.mapping.node_drafts import observe_node
+from topoloc.mapping.node_drafts import collect_virtual_nodes, observe_node
 from topoloc.mapping.nodes import find_nearest_nodes
 from topoloc.mapping.storage.entries import change_each
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
-from topoloc.mapping.virtual_nodes import collect_virtual_nodes
 from topoloc.node_ids import NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
 

@@ -26,13 +26,14 @@ from topoloc.lifelong.scale_estimation import (
     find_motion_consensus,
     scale_to_metres,
 )
-from topoloc.lifelong.session_checks import check_calibration, check_focal_length
 from topoloc.lifelong.session_poses import (
     MIN_AGREEING,
     SLACK,
     SLACK_DEG,
     SessionPoses,
     align_motion_to_map,
+    check_calibration,
+    check_focal_length,
     select_queried_frames,
 )
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory, correct_trajectory

@@ -26,13 +26,16 @@ from topoloc.lifelong.light_learning import (
 )
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.prune import measure_file_size, prune_map
-from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
     SessionContent,
     create_session_content,
     update_coarse_models,
 )
-from topoloc.lifelong.session_poses import SessionPoses, estimate_poses_by_motion
+from topoloc.lifelong.session_poses import (
+    SessionPoses,
+    check_session_is_new,
+    estimate_poses_by_motion,
+)
 from topoloc.lifelong.single_camera_poses import estimate_poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
@@ -46,11 +49,10 @@ from topoloc.mapping.mapping_frames import (
     create_session,
     select_posed_frames,
 )
+from topoloc.mapping.node_drafts import add_virtual_nodes
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.sessions import Session
-from topoloc.mapping.storage.entries import overlay
+from topoloc.mapping.storage.entries import Session, overlay
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
-from topoloc.mapping.virtual_nodes import add_virtual_nodes
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import with_poses

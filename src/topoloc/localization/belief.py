@@ -14,7 +14,9 @@ another hypothesis. Its probability is 1 / (1 + 1/o + sum of e^-d).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +29,7 @@ from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.provenance import Evidence, log_doubt, log_even_share
 
 _CHI_SQUARE_6_AT_95 = 12.592
+MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
 
 
 class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -81,8 +84,29 @@ class Hypothesis:
 
 
 def log_odds_margin(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
-    """Return the log-odds margin of `a` over `b`."""
+    """Return the log-odds margin of `a` over `b`, two hypotheses of one feature type."""
     return float(_log_odds_margins((a, b), weights)[0, 1])
+
+
+T = TypeVar("T")
+
+
+def share_probability(odds_against: float, margins: Sequence[float]) -> list[float]:
+    """Return the probability of the best hypothesis, then that of each other one.
+
+    Args:
+        odds_against: odds of none of them against the best one.
+        margins: log-odds margin of the best one over each other one.
+    """
+    total = 1.0 + odds_against + sum(math.exp(-margin) for margin in margins)
+    return [1.0 / total, *(math.exp(-margin) / total for margin in margins)]
+
+
+def select_probable(found: Sequence[T], shares: Sequence[float]) -> list[tuple[T, float]]:
+    """Return those with at least 1 % of the first one's probability, with it, likeliest first."""
+    pairs = zip(found, shares, strict=True)
+    probable = [pair for pair in pairs if pair[1] >= MIN_ALTERNATIVE_RATIO * shares[0]]
+    return sorted(probable, key=lambda pair: -pair[1])
 
 
 def _log_odds_margins(

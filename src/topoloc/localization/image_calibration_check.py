@@ -28,8 +28,7 @@ from topoloc.geometry.calibration_check import (
     estimate_image_calibration,
 )
 from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import cells_of
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraPrior,
     Vector,
@@ -43,8 +42,8 @@ from topoloc.geometry.joint_camera.joint_fit import (
     linearized_fit,
     weigh_cameras,
 )
+from topoloc.geometry.pose_matches import cells_of
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.guided import match_guided
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.result import Localization, NotLocalized

@@ -4,11 +4,11 @@ The coarse localizer ranks candidate nodes. The image is patch-normalised and it
 matched with those of the nodes. PnP on the matches gives the camera's global pose.
 
 The paper keeps the first pose without a check. This localizer runs one loop over pose proposals
-instead. `schedule.py` generates them, cheapest and likeliest first. Each one is verified in the
-same way (`search.py`): it is refined and its evidence counted. It then enters the belief over
-hypotheses (`belief.py`), until the result is settled. A pose is reported only if its evidence is
-strong and no other place explains the image as well. A map is an atlas of one tile. Of several
-tiles, the poses are compared (`tiles/tiles.py`).
+instead (`map_query.py`), cheapest and likeliest first. Each one is verified in the same way
+(`search.py`): it is refined and its evidence counted. It then enters the belief over hypotheses
+(`belief.py`), until the result is settled. A pose is reported only if its evidence is strong and no
+other place explains the image as well. The checks of `checks.py` then change or refuse it. A map is
+an atlas of one tile. `schedule.py` chooses tiles, and `tiles/tiles.py` compares their poses.
 
 These settings give the paper's own behaviour: `num_candidates=1`, `guided.num_nodes=0`,
 `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`.
@@ -19,24 +19,23 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topoloc.atlas.config import AtlasConfig
 from topoloc.bounds import check_bounds
-from topoloc.errors import AtlasError, MapError
-from topoloc.geometry.camera import Camera
+from topoloc.errors import AtlasError
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.answer import ResultWithInliers
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.query import CameraLike, Deadline, QueryImage, StageClock, camera_of
 from topoloc.localization.result import Localization, NotLocalized, R, with_time
-from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.schedule import Schedule
-from topoloc.localization.search import Trace, verify
+from topoloc.localization.search import Trace
 from topoloc.localization.tiles.tiles import Reach, TileRanking, Tiles
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
@@ -256,17 +255,11 @@ class Localizer:
             self._tiles, self.tile_config, query_image, deadline, self._reach, trace
         )
         if prior is not None or tile_id is not None or len(self.tile_ids) == 1:
-            proposals = schedule.propose_in_tile(self._tile_id(tile_id), prior=prior)
+            schedule.search_tile(self._tile_id(tile_id), prior=prior)
         elif self._reach is not None and not self._reach:
             return NotLocalized("not_in_map", detail=self._nothing_in_reach), []
         else:
-            proposals = schedule.propose_all()
-        with closing(proposals):
-            for proposal in proposals:
-                try:
-                    proposal.search.add(verify(proposal))
-                except MapError as error:
-                    proposal.search.failure = error
+            schedule.search_all()
         return schedule.outcome()
 
     def rank_tiles(self, image: Image, camera: Camera | UncalibratedCamera) -> TileRanking:

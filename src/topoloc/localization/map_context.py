@@ -10,16 +10,14 @@ from msgspec import structs
 
 from topoloc.errors import WeightsError
 from topoloc.features.feature_types import check_available, select_stored_types
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
 from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Deadline, Query, QueryImage, StageClock, reduce_image
-from topoloc.localization.result import Localization, NotLocalized, R, Reason
-from topoloc.localization.result_decision import ResultWithInliers
+from topoloc.localization.result import NotLocalized, R
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
@@ -153,29 +151,6 @@ class MapContext:
             searches.append(search)
         return searches
 
-    def name_outcome(
-        self, outcome: ResultWithInliers, camera: Camera | UncalibratedCamera
-    ) -> ResultWithInliers:
-        """Return a result and its poses `with_provenance`. A pose below the threshold of the map's
-        certificate is refused, and one that looks as on another floor."""
-        result, poses = outcome
-        certified = self.topomap.certificate
-        least = 0.0 if certified is None else certified.applied_min_probability
-        if isinstance(result, Localization) and result.probability < least:
-            why = f"probability {result.probability:.3g}, below the map's certified threshold"
-            result, poses = _refuse(result, "too_few_inliers", f"{why} {least:.3g}"), []
-        elif (
-            isinstance(result, Localization)
-            and result.probability < self.config.evidence.min_probability
-        ):
-            why = "without colours in view nothing tells the look-alike floors apart"
-            if (seen := result.appearance) is not None:
-                why = f"the shape agrees, but not the colours, as on another floor ({seen:.2g})"
-            result, poses = _refuse(result, "not_in_map", why), []
-        return self.with_provenance(result, camera), [
-            (self.with_provenance(one, camera), seen) for one, seen in poses
-        ]
-
     def with_provenance(
         self, result: R, camera: Camera | UncalibratedCamera | None = None, t_ns: int | None = None
     ) -> R:
@@ -201,21 +176,6 @@ class MapContext:
             provenance=provenance,
             geopose=georeference.geopose(result.world_from_cam) if georeference else None,
         )
-
-
-def _refuse(result: Localization, reason: Reason, detail: str) -> NotLocalized:
-    """Return the refusal of a pose."""
-    return NotLocalized(
-        reason,
-        result.candidates,
-        result.num_matches,
-        result.num_inliers,
-        result.times_ms,
-        detail,
-        provenance=result.provenance,
-        seen_camera=result.seen_camera,
-        appearance=result.appearance,
-    )
 
 
 def select_feature_types(

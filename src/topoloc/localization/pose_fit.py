@@ -11,10 +11,9 @@ from jaxtyping import Float, Float32, Int
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera, nominal_camera
 from topoloc.geometry.pose_matches import MIN_POINTS
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera, nominal_camera
 from topoloc.mapping.topomap import TopoNode
 from topoloc.node_ids import NodeId
 

@@ -23,10 +23,8 @@ from jaxtyping import UInt8
 from topoloc.errors import QueryError
 from topoloc.features.extraction import FeatureConfig, extract_from_normalized, normalize_image
 from topoloc.features.features import Features
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera, nominal_camera
-from topoloc.recordings.frame import to_grey
-from topoloc.recordings.frame_checks import find_image_problem
+from topoloc.geometry.camera import Camera, UncalibratedCamera, nominal_camera
+from topoloc.recordings.frame import find_image_problem, to_grey
 from topoloc.retrieval.coarse import Image
 
 

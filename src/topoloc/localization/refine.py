@@ -15,6 +15,7 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.answer import Answer, lead
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.evidence import (
     compute_best_case_evidence,
@@ -24,8 +25,6 @@ from topoloc.localization.evidence import (
 from topoloc.localization.guided import match_guided
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.provenance import Evidence
-from topoloc.localization.result import Localization
-from topoloc.localization.result_decision import ResultWithInliers, decide_final_result
 from topoloc.localization.search import Proposal, Search
 from topoloc.node_ids import NodeId, Row
 
@@ -160,8 +159,8 @@ def fit_around(
         return fit_pose(*matched, config.pose, start, min_matches, search.correlated_error_share)
 
 
-def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:
-    """Return the evidence of the refined proposal if all unguided matches agreed with it.
+def find_best_case(proposal: NodeProposal) -> Hypothesis | None:
+    """Return the refined proposal as a hypothesis with which all unguided matches agree.
 
     None if too few points were found.
     """
@@ -169,11 +168,13 @@ def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:
     if not isinstance(final, PoseFit) or final.num_inliers < search.config.evidence.min_found:
         return None
     with search.query.clock.stage("evidence"):
-        inflated = 1.0 + final.num_inliers * search.correlated_error_share
-        return compute_best_case_evidence(search, final, final.pose.inflated(inflated))
+        covariance = final.pose.inflated(1.0 + final.num_inliers * search.correlated_error_share)
+        evidence = compute_best_case_evidence(search, final, covariance)
+    log_odds = search.weights.log_odds(evidence)
+    return Hypothesis(proposal.source, final, evidence, covariance, 1.0, log_odds)
 
 
-def confirm_hypotheses(first: Search, last: Search) -> ResultWithInliers:
+def confirm_hypotheses(first: Search, last: Search) -> Answer:
     """Confirm the hypotheses of the first feature type with the last one.
 
     The reported pose is the one with the higher log-odds. In changed light, points of the first
@@ -193,12 +194,11 @@ def confirm_hypotheses(first: Search, last: Search) -> ResultWithInliers:
             if from_last is not None and is_from_last:
                 by_last[id(one)] = replace(from_last, log_odds=one.log_odds)
         confirmed = confirmed.with_hypothesis(one, config, weights)
-    outcome = decide_final_result(replace(first, belief=confirmed))
-    best = confirmed.best(weights)
-    if not isinstance(outcome[0], Localization) or best is None or id(best) not in by_last:
-        return outcome
-    belief = Belief().with_hypothesis(by_last[id(best)], config, last.weights.rivals)
-    return decide_final_result(replace(last, belief=belief))
+    answer = lead(replace(first, belief=confirmed))
+    if answer.pose is None or id(answer.best) not in by_last:
+        return answer
+    belief = Belief().with_hypothesis(by_last[id(answer.best)], config, last.weights.rivals)
+    return lead(replace(last, belief=belief))
 
 
 def cross_check_hypothesis(

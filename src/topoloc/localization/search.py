@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
@@ -19,6 +18,9 @@ from topoloc.localization.query import Query
 from topoloc.localization.result import CandidateNode
 from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import NodeScore
+
+if TYPE_CHECKING:
+    from topoloc.localization.answer import Finding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -55,10 +57,11 @@ class TriedProposal(OneLine):
 
 @dataclass(eq=False, repr=False)
 class Trace(OneLine):
-    """Collect all tried pose proposals, in order, and the nodes without a usable image that the
-    last step met."""
+    """Collect all tried pose proposals and the findings of the checks, in order, and the nodes
+    without a usable image that the last step met."""
 
     tried: list[TriedProposal] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
     nodes_without_image: set[NodeId] = field(default_factory=set)
 
 
@@ -113,8 +116,6 @@ class Search:
     """The search with the preceding feature type, which left the pose unclear."""
     is_last: bool = True
     """True if no other feature type follows."""
-    failure: MapError | None = None
-    """The reason why the map cannot be read any more."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
     num_retrieved: int = 0
@@ -125,8 +126,6 @@ class Search:
     """True if the best pose is one of many from which a repetitive place looks the same."""
     is_stopped: bool = False
     """True if the time limit was reached before all proposals were tried."""
-    is_refuted: bool = False
-    """True if the image contradicts its calibration, and the pose was refused for that."""
 
     @property
     def candidates(self) -> list[NodeScore]:

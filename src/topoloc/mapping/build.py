@@ -35,16 +35,24 @@ from topoloc.mapping.node_drafts import (
     MIN_NODE_POINTS,
     NodeDraft,
     NodeDrafts,
+    collect_virtual_nodes,
     create_node_draft,
     finish_node,
     observe_draft,
+    select_virtual_view_nodes,
 )
 from topoloc.mapping.nodes import NodeConfig, NodePoses, find_nearest_nodes, select_node_frames
-from topoloc.mapping.sessions import Edit, Illumination, Session, today
-from topoloc.mapping.storage.entries import PlaceImage, TopoNode
+from topoloc.mapping.storage.entries import (
+    Edit,
+    Illumination,
+    Layer,
+    PlaceImage,
+    Session,
+    TopoNode,
+    today,
+)
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
-from topoloc.mapping.topomap import Layer, TopoMetricMap
-from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.recording import find_pose_source, read_left_frame

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from topoloc.errors import MapError
-from topoloc.mapping.sessions import Illumination, Session
-from topoloc.mapping.storage.entries import NodeSummary
+from topoloc.mapping.storage.entries import Illumination, NodeSummary, Session
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import (

@@ -24,8 +24,13 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.sessions import Illumination, Session, average_illumination
-from topoloc.mapping.storage.entries import Edge, PlaceImage
+from topoloc.mapping.storage.entries import (
+    Edge,
+    Illumination,
+    PlaceImage,
+    Session,
+    average_illumination,
+)
 from topoloc.node_ids import NodeId
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.points.motion_triangulation import (

@@ -1,8 +1,8 @@
 """Define the topo-metric map (section III-A of the paper): nodes with features and 3-D positions,
 edges, place images.
 
-`build.py` creates it, `map_writing.py` writes it, `map_reading.py` reads it, and `localization`
-uses it.
+`build.py` creates it, `map_writing.py` writes it, `map_reading.py` reads it, `edit.py` edits it,
+and `localization` uses it.
 
 Every entry has an id that never changes and is never reused. Computations use rows: row i is
 `summaries[i]` and `nodes[i]`. `row_of` converts an id to a row.
@@ -11,66 +11,41 @@ Every entry has an id that never changes and is never reused. Computations use r
 from __future__ import annotations
 
 import html
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, no_type_check
 
 import numpy as np
 
-from topoloc.errors import FeatureTypeError, MapError
+from topoloc.errors import EmptyMapError, FeatureTypeError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.certificate import Certificate
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
-from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.storage.entries import (
-    CorrelatedErrors,
     Edge,
+    Edit,
+    Layer,
+    NextIds,
     NodeSummary,
     PlaceImage,
     Repetitions,
+    Session,
     TopoNode,
     VirtualNodes,
 )
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.node_ids import NodeId, Row, as_rows
-from topoloc.retrieval.coarse import CoarseModel
 
 if TYPE_CHECKING:
     from topoloc.mapping.storage.map_file import MapFile
 
 
-@dataclass(frozen=True)
-class NextIds:
-    """Hold the ids of the next new entries. They are larger than any id ever used in the map."""
-
-    session: int = 0
-    node: int = 0
-    place_image: int = 1
-    side_node: int = 0
-    edit: int = 1
-
-
 _MAP_ID = b"map id"
-
-
-@no_type_check  # a type check at run time would read entries from the file
-@dataclass(frozen=True, eq=False)
-class Layer:
-    """Hold the part of a map that belongs to one feature type.
-
-    - `nodes[i]` is the node of row i with its points of this type.
-    - `coarse_models` holds coarse localizers by name. Those that need no local features stand in
-      the first layer only.
-    - `shared_errors` is None if not measured.
-    """
-
-    nodes: Sequence[TopoNode]
-    coarse_models: Mapping[str, CoarseModel] = field(default_factory=dict)
-    shared_errors: CorrelatedErrors | None = None
 
 
 @no_type_check  # as for layers
@@ -107,7 +82,7 @@ class TopoMetricMap:
     sides: VirtualNodes | None = None
     sessions: Sequence[Session] = ()
     edits: Sequence[Edit] = ()
-    next_ids: NextIds = NextIds()
+    next_ids: NextIds = field(default_factory=NextIds)
     map_id: str | None = None
     georeference: Georeference | None = None
     certificate: Certificate | None = None
@@ -173,9 +148,45 @@ class TopoMetricMap:
     def describe(self, path: str | Path) -> dict[str, Any]:
         """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,
         sessions, edits, configuration. Raises EmptyMapError: the map has no node."""
-        from topoloc.mapping.storage.integrity_check import describe_map
+        from topoloc.mapping.storage.map_reading import list_coarse_models
 
-        return describe_map(self, Path(path))
+        path = Path(path)
+        if len(self.summaries) == 0:
+            raise EmptyMapError(f"map {path} has no nodes")
+        models = list_coarse_models(path)
+        centres = np.array([s.world_from_cam.translation for s in self.summaries])
+        num_nodes = Counter(summary.session_id for summary in self.summaries)
+        return {
+            "path": str(path),
+            "map": self.id,
+            "version": self.version,
+            "georeference": None if self.georeference is None else self.georeference.to_json(),
+            "certificate": self.describe_certificate(),
+            "bytes": path.stat().st_size,
+            "num_nodes": len(self.summaries),
+            "num_points": sum(s.num_points for s in self.summaries),
+            "num_side_nodes": len(self.sides.summaries) if self.sides else 0,
+            "num_place_images": len(self.place_images),
+            "length_m": round(self.length_m, 3),
+            "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
+            "recordings": sorted({s.recording for s in self.summaries}),
+            "sessions": [
+                asdict(session)
+                | {
+                    "camera": None if session.camera is None else session.camera.to_json(),
+                    "start_date": session.start_date,
+                    "end_date": session.end_date,
+                    "num_nodes": num_nodes[session.session_id],
+                }
+                for session in self.sessions
+            ],
+            "edits": [asdict(edit) for edit in self.edits],
+            "coarse": [model["name"] for model in models],
+            "default_coarse": self.default_coarse,
+            "kinds": self.kinds,
+            "coarse_models": models,
+            "config": self.config.to_json(),
+        }
 
     def describe_certificate(self) -> dict[str, Any] | None:
         """Return the certificate as JSON, with its promise and whether the map was edited since."""
@@ -243,35 +254,20 @@ class TopoMetricMap:
         """Write the map file atomically. A file that is replaced is kept, and `undo_edit` brings it
         back. Waits while another process edits the map at `path`, and calls `on_wait` once before.
         Raises MapError."""
-        from topoloc.mapping.edit import save_map
+        from topoloc.mapping.storage.map_writing import save_map
 
         save_map(self, Path(path), on_wait)
 
     @staticmethod
-    def load(path: str | Path) -> TopoMetricMap:
-        """Open a map file. Nodes are read when accessed. Raises MapError, MapVersionError."""
-        from topoloc.mapping.storage.map_reading import open_map
+    def load(path: str | Path, digest: str | None = None) -> TopoMetricMap:
+        """Open a map file. Nodes are read when accessed. Raises MapVersionError, and MapError
+        also if the map has another digest than the given one."""
+        from topoloc.mapping.storage.map_reading import open_contents
 
-        return open_map(Path(path))
-
-    @staticmethod
-    def set_look_alike_floors(
-        path: str | Path, value: bool, on_wait: Callable[[], None] | None = None
-    ) -> None:
-        """Change `MapConfig.look_alike_floors` of a map file, as one edit. Raises MapError: all
-        images are grey, or the map cannot be read or written."""
-        from topoloc.mapping.edit import edit_map
-
-        with edit_map(path, on_wait) as edit:
-            lights = [session.light for session in edit.topomap.sessions]
-            if value and lights and all(one and one.red == one.blue == 1.0 for one in lights):
-                raise MapError(
-                    f"map {path} has no colours to tell floors apart: all its images are grey;"
-                    f" `topoloc update {path} SEQ` adds a recording in colour"
-                )
-            config = replace(edit.topomap.config, look_alike_floors=value)
-            name = f"look-alike floors: {'yes' if value else 'no'}"
-            edit.commit(replace(edit.topomap, config=config), name)
+        file, fields = open_contents(Path(path), digest)
+        topomap = TopoMetricMap(**fields)
+        topomap.__dict__["_opened"] = file  # not a field, so that a changed copy has no file
+        return topomap
 
     def close(self) -> None:
         """Close the file if the map was loaded. Later reads raise MapError."""
@@ -293,6 +289,4 @@ class TopoMetricMap:
     def __reduce__(self) -> Any:
         if self.file is None:
             return super().__reduce__()
-        from topoloc.mapping.storage.map_reading import open_map
-
-        return open_map, (self.file.path.absolute(), self.file.digest)
+        return TopoMetricMap.load, (self.file.path.absolute(), self.file.digest)

@@ -16,20 +16,22 @@ from pathlib import Path
 from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
-from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration, read_camera_json
+from topoloc.recordings.camera_files import (
+    FILE_NAME,
+    YAML_SUFFIXES,
+    CameraCalibration,
+    find_right_file,
+    has_slam_settings,
+    is_calibration,
+    read_calibration_yaml,
+    read_camera_json,
+    read_yaml,
+)
 from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import image_size
 from topoloc.recordings.recording import Recording
 from topoloc.recordings.slam_settings import camera_files, read_slam_settings
-from topoloc.recordings.stereo_yaml import (
-    YAML_SUFFIXES,
-    find_right_file,
-    has_slam_settings,
-    is_calibration,
-    read_calibration_yaml,
-    read_yaml,
-)
 
 CalibrationForSize = Callable[[int, int], CameraCalibration]
 """Returns the calibration for images of this width and height (pixels). Raises CalibrationError."""

@@ -11,8 +11,7 @@ from jaxtyping import Float32
 from topoloc.errors import MissingExtraError, RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import DepthImage
-from topoloc.recordings.frame_checks import find_depth_problem
+from topoloc.recordings.frame import DepthImage, find_depth_problem
 from topoloc.recordings.image_io import MAX_PIXELS, read_depth
 
 

@@ -16,9 +16,15 @@ import numpy as np
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.camera_json import CameraCalibration
+from topoloc.recordings.camera_files import (
+    CameraCalibration,
+    make_camera,
+    make_rig,
+    read_yaml,
+    yaml_numbers,
+    yaml_word,
+)
 from topoloc.recordings.ros_calibration import RosCalibration
-from topoloc.recordings.stereo_yaml import make_camera, make_rig, read_yaml, yaml_numbers, yaml_word
 from topoloc.recordings.text_files import parse_relative_path
 
 _Size = tuple[float, float]

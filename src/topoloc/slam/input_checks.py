@@ -16,7 +16,7 @@ from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.matching import match_features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.pose_conventions import UNITS
-from topoloc.points.disparity import MeasuredView
+from topoloc.points.metric_points import MeasuredView
 from topoloc.points.point_tracking import align_with_reference
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame

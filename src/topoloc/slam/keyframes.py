@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, Int
 from topoloc.disk_list import DiskList
 from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.disparity import StereoCamera
-from topoloc.points.metric_points import MetricPoints
+from topoloc.points.metric_points import MetricPoints, StereoCamera
 
 
 @dataclass(eq=False)

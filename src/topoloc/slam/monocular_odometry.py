@@ -17,12 +17,11 @@ from jaxtyping import Float, Float32, Int
 
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.disparity import MeasuredView, StereoCamera
+from topoloc.points.metric_points import MeasuredView, StereoCamera
 from topoloc.points.point_tracking import find_corners, track_points
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.frame_preparation import undistort_frame
 from topoloc.slam.bundle.bundle_adjustment import adjust_bundle, adjust_window
-from topoloc.slam.frame_tracker import FrameTracker
 from topoloc.slam.keyframes import (
     FramePose,
     KeyFrame,
@@ -31,7 +30,7 @@ from topoloc.slam.keyframes import (
     Observations,
     triangulate_points,
 )
-from topoloc.slam.step_estimation import LastFrame, Step, Tracks
+from topoloc.slam.step_estimation import FrameTracker, LastFrame, Step, Tracks
 
 _PATCH_HALF_PX = 7
 

@@ -21,11 +21,10 @@ from jaxtyping import Float
 from topoloc.compiled import mark_worker_thread
 from topoloc.disk_list import DiskList
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.disparity import MeasuredView, measure_disparities, measured_view
+from topoloc.points.metric_points import MeasuredView, measure_disparities, measured_view
 from topoloc.points.point_tracking import find_corners
 from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.bundle.bundle_adjustment import adjust_window
-from topoloc.slam.frame_tracker import FrameTracker
 from topoloc.slam.input_checks import measure_right_residuals
 from topoloc.slam.keyframes import (
     FramePose,
@@ -37,7 +36,7 @@ from topoloc.slam.keyframes import (
 )
 from topoloc.slam.motion_prediction import select_expected_pose
 from topoloc.slam.place_matching import RepetitionCheck, extract_place_features, match_places
-from topoloc.slam.step_estimation import Step, Tracks
+from topoloc.slam.step_estimation import FrameTracker, Step, Tracks
 
 # bytes of about 80 places in memory, because matching two takes ten times as long as reading one
 _MAX_PLACE_BYTES = 16_000_000

@@ -18,8 +18,7 @@ from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.disparity import StereoCamera
-from topoloc.points.metric_points import MetricPoints, locate_points
+from topoloc.points.metric_points import MetricPoints, StereoCamera, locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.slam.keyframes import PlaceFeatures
 from topoloc.slam.motion_prediction import Prediction

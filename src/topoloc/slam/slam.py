@@ -26,7 +26,7 @@ from topoloc.geometry.alignment import (
 )
 from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.json_data import OneLine
-from topoloc.points.disparity import MeasuredView, measured_view
+from topoloc.points.metric_points import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import with_poses

@@ -17,8 +17,7 @@ import numpy as np
 
 from topoloc.geometry.absolute_pose_focal import camera_prior, parameters_of, with_parameters
 from topoloc.geometry.calibration_check import MIN_IMAGES, MIN_PLACES
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import cells_of
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraHypothesis,
     CameraLikelihood,
@@ -32,9 +31,8 @@ from topoloc.geometry.joint_camera.joint_fit import (
     linearized_fit,
     weigh_cameras,
 )
-from topoloc.geometry.pose_matches import CAUCHY_SCALE
+from topoloc.geometry.pose_matches import CAUCHY_SCALE, cells_of
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.query import Deadline, QueryImage, unknown_camera

@@ -15,13 +15,12 @@ from jaxtyping import Float
 
 from topoloc.bounds import check_bounds
 from topoloc.errors import QueryError
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import CameraLike, Deadline, camera_of, check_image_size
 from topoloc.localization.result import Localization, NotLocalized, with_time
-from topoloc.recordings.frame_checks import find_time_problem
+from topoloc.recordings.frame import find_time_problem
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.map_stream import MapStream

@@ -28,8 +28,7 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.walls.place_comparison import estimate_upright_pose
 from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import DepthImage, StereoFrame
-from topoloc.recordings.frame_checks import MemorySequence
+from topoloc.recordings.frame import DepthImage, MemorySequence, StereoFrame
 from topoloc.slam.bundle.block_kernels import solve_factored
 from topoloc.tracking.tracker import Tracker
 

@@ -1,4 +1,4 @@
-"""Pictures of another world, a recording to be broken, and files of settings."""
+"""Provide out-of-map images, a recording that tests may damage, and settings files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from built_room import unseen_views, write_pictures
 
 @pytest.fixture(scope="session")
 def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Pictures of another world."""
+    """Return a folder of images of another room."""
     return write_pictures(
         tmp_path_factory.mktemp("queries") / "elsewhere", unseen_views(seed=1, step=4.0)
     )
@@ -21,13 +21,13 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def recording(tiny_recording: Path, tmp_path: Path) -> Path:
-    """A copy of `tiny_recording`, to be broken."""
+    """Return a copy of `tiny_recording` that a test may damage."""
     return Path(shutil.copytree(tiny_recording, tmp_path / "recording"))
 
 
 @pytest.fixture
 def file_of(tmp_path: Path) -> Callable[[str | bytes], str]:
-    """Writes a TOML file and returns its path."""
+    """Return a function that writes a TOML file and returns its path."""
 
     def write(content: str | bytes) -> str:
         path = tmp_path / "my.toml"

@@ -1,5 +1,5 @@
-"""Every known failure is one line on stderr that says what and where, exit status 1, and no file is
-touched."""
+"""Check that each known failure prints one line with fault and place, exits with 1 and
+changes no file."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 
@@ -158,7 +159,8 @@ OUTPUTS += [("info", "--json"), ("build", "MAP")]
 def command_with_output(
     recording: Path, room_map: Path, queries: Path, tmp_path: Path
 ) -> Callable[[str, str, Path], list[object]]:
-    """The arguments of a command one of whose outputs is this path."""
+    """Return a function that makes the arguments of a command, one of whose outputs
+    is a given path."""
 
     def arguments(command: str, option: str, output: Path) -> list[object]:
         if option == "MAP":
@@ -304,7 +306,7 @@ def test_the_maps_camera_for_a_picture_of_another_shape(
 
 @pytest.fixture
 def square_picture(tmp_path: Path) -> Path:
-    """A square picture."""
+    """Return the path of a square image."""
     path = tmp_path / "square.pgm"
     path.write_bytes(b"P5 300 300 255\n" + bytes(90000))
     return path
@@ -345,7 +347,7 @@ def test_bugs_are_not_hidden(room_map: Path, monkeypatch: pytest.MonkeyPatch):
         def bug(*_: object, kind: type[Exception] = kind) -> None:
             raise kind
 
-        monkeypatch.setattr("topoloc.mapping.storage.integrity_check.describe_map", bug)
+        monkeypatch.setattr(TopoMetricMap, "describe", bug)
         with pytest.raises(kind):
             main(["info", str(room_map)])
 

@@ -1,5 +1,4 @@
-"""The commands from end to end: what they print, what they write, and that they do it the same way
-twice."""
+"""Run the commands end to end: their printed lines, their files, and equal results in two runs."""
 
 from __future__ import annotations
 

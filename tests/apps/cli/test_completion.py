@@ -1,4 +1,4 @@
-"""`topoloc --completion` completes commands, options and actions in the shells that are here."""
+"""Test `topoloc --completion`: the installed shells complete commands, options and actions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _script(shell: str) -> str:
 
 
 def _complete(folder: Path, *words: str) -> list[str]:
-    """What bash offers for the last word."""
+    """Return the completions of the last word in bash."""
     (folder / "script").write_text(_script("bash"), encoding="utf-8")
     command = ["bash", "-c", _TYPED, "-", str(folder / "script"), *words]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()

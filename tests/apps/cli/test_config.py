@@ -1,5 +1,4 @@
-"""`topoloc config` and `--config FILE` on every command that has settings; and help that can be
-read."""
+"""Test `topoloc config`, `--config FILE` on each command with settings, and readable help."""
 
 from __future__ import annotations
 

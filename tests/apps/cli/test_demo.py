@@ -1,5 +1,5 @@
-"""`topoloc demo` from end to end, on the recordings that it brings along and on a small room laid
-out like them."""
+"""Run `topoloc demo` end to end, on its own recordings and on a small room with
+the same folders."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SETS = ["day", "night", "other camera", "elsewhere"]
 
 @pytest.fixture(scope="module")
 def room(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny room in folders named as the demo's."""
+    """Return the tiny room in folders with the names of the demo's folders."""
     folder = tmp_path_factory.mktemp("demo")
     shutil.copytree(tiny_recording, folder / "map_lap1")
     write_stereo_recording(folder / "map_lap2", indices=[0.5, 6.5, 11.5])

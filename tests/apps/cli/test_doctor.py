@@ -1,4 +1,4 @@
-"""`topoloc doctor` tells what is installed, tests it, and has a remedy for each fault."""
+"""Test `topoloc doctor`: it lists and tests the installation and prints a remedy for each fault."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def _run(*command: str | Path, **environment: str) -> subprocess.CompletedProces
 
 
 def _rows(printed: str) -> dict[str, str]:
-    """The printed lines by their first column."""
+    """Return the printed lines by their first column."""
     return dict(line.split("  ", 1) for line in printed.splitlines())
 
 
 @pytest.fixture
 def no_self_test(monkeypatch: pytest.MonkeyPatch):
-    """Leaves the slow part out."""
+    """Replace the slow self-test by an empty one."""
     monkeypatch.setitem(doctor._PARTS, "self_test", lambda: ({}, []))
 
 

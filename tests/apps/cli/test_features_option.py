@@ -1,5 +1,4 @@
-"""--features: maps of several kinds are built and asked, and kinds that are not to be had are one
-line."""
+"""Test --features: maps of several feature types, and one line for a missing feature type."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ def built(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> Callable[..., Path]:
-    """A small map of these features; XFeat's network is gone afterwards."""
+    """Return a function that builds a map of these feature types, then removes XFeat's network."""
 
     def build(features: str) -> Path:
         (tmp_path / "cache").mkdir()
@@ -57,7 +56,7 @@ def built(
 
 
 def _answers(capfd: pytest.CaptureFixture[str], *args: object) -> tuple[list[dict[str, Any]], str]:
-    """Lines of `topoloc localize`, and what stands on standard error."""
+    """Return the lines of `topoloc localize` and its standard error."""
     capfd.readouterr()
     assert main(["localize", *map(str, args), "--json", "-"]) == 0
     printed = capfd.readouterr()

@@ -1,4 +1,4 @@
-"""On a full disk, or with few file handles, a command does its work or changes nothing."""
+"""Check that a command succeeds or changes nothing on a full disk or with few file handles."""
 
 from __future__ import annotations
 

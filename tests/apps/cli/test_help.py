@@ -1,5 +1,5 @@
-"""The help of options is running text, whatever the lines of the source; and poses that belong to
-images are no trajectory."""
+"""Check that the help of an option is one paragraph, and that Nerfstudio poses are
+no trajectory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Files written whole or not at all; a progress bar on terminals only; answers in one line."""
+"""Test outputs: complete files or none, a progress bar on terminals only, and
+refusals in one line."""
 
 from __future__ import annotations
 
@@ -124,8 +125,7 @@ SAYING = [
 def test_output_that_cannot_be_written_is_one_line_at_most(
     args: list[str], unbuffered: str, room_map: Path
 ):
-    """To a device that is full, and to a reader that went away: neither leaves a traceback, not
-    even as Python ends."""
+    """A full device and a closed pipe print no traceback, not even when Python exits."""
     command = [
         sys.executable,
         "-m",

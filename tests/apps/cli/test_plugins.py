@@ -1,4 +1,5 @@
-"""Other distributions' entry points: a broken one costs a line on stderr and nothing else."""
+"""Check that a broken entry point of another distribution prints one warning and has
+no other effect."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ BROKEN = {
 
 @pytest.fixture(params=BROKEN)
 def broken(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
-    """A folder with an installed distribution whose entry points cannot be loaded, and why."""
+    """Return a folder with an installed distribution whose entry points fail to load,
+    and the reason."""
     target, reason = BROKEN[request.param]
     metadata = tmp_path / "broken_plugin-1.0.dist-info"
     metadata.mkdir()

@@ -1,4 +1,5 @@
-"""Commands say how they understood a recording; answers are not taken for its ground truth."""
+"""Check that commands print how they interpret a recording and never use results as
+its ground truth."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Settings as TOML: how a configuration is printed, what of a file is read, and what is said of a
-bad one."""
+"""Test settings in TOML: how a configuration is printed and read, and the errors of
+an invalid file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Cart:
-    """What is drawn."""
+    """A cart."""
 
     front: Wheel = field(default_factory=lambda: Wheel(0.5))
     """The wheel at the front."""
@@ -59,7 +59,7 @@ class Cart:
 
 
 CART = """\
-# What is drawn.
+# A cart.
 [cart]
 # Painted on its side.
 # name =
@@ -177,7 +177,7 @@ def _trees(name: str) -> st.SearchStrategy[Any]:
 
 
 def _refusal(read: Callable[[], Any]) -> str | None:
-    """What a ConfigError says; any other exception is passed on."""
+    """Return the text of a ConfigError, or None. Any other exception is passed on."""
     try:
         read()
     except ConfigError as error:

@@ -1,5 +1,4 @@
-"""`topoloc weights`: networks are listed, fetched and taken from files; what does not fit is one
-line and changes nothing."""
+"""Test `topoloc weights`: list, download and import networks. A bad file changes nothing."""
 
 from __future__ import annotations
 
@@ -23,7 +22,8 @@ PUBLISHED = b"the published weights"
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache. EdgePoint2-T32 is known by weights of ours, at an address of this machine."""
+    """Return an empty cache. The weights of EdgePoint2-T32 are a file of this test,
+    with a local URL."""
     folder = tmp_path / "cache"
     source = tmp_path / "T32.pth"
     source.write_bytes(PUBLISHED)
@@ -39,7 +39,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def converter(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
-    """A training distribution that converts anything; what it was given."""
+    """Install a training distribution that converts anything, and return the list of its inputs."""
     given: list[bytes] = []
 
     def convert(kind: str, data: bytes, target: Path, properties: dict[str, str]) -> None:

@@ -1,5 +1,5 @@
-"""A cluster of two machines, each with one processor, both of them this one; and small
-recordings."""
+"""Provide a cluster of two nodes with one processor each, both on this machine, and
+small recordings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_dashboard": 
 
 @pytest.fixture(scope="module")
 def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder for temporary files of the cluster's workers."""
+    """Return the folder for temporary files of the cluster's workers."""
     folder = tmp_path_factory.mktemp("scratch")
     (folder / "ray").mkdir()  # where Ray notes the address of the last cluster
     return folder
@@ -26,7 +26,7 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def cluster(scratch: Path) -> Iterator[Any]:
-    """Two nodes; topoloc lies where this process finds it."""
+    """Start two nodes that import topoloc from the paths of this process."""
     pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
     from ray.cluster_utils import Cluster
 
@@ -47,7 +47,7 @@ def cluster(scratch: Path) -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def walks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Recordings of three rooms, a few pairs each."""
+    """Return recordings of three rooms with a few stereo pairs each."""
     from tiny_world import write_stereo_recording
 
     folder = tmp_path_factory.mktemp("walks")

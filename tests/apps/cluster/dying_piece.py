@@ -1,4 +1,4 @@
-"""A piece of an evaluation whose worker dies the first time; workers import this module."""
+"""Define a piece of an evaluation that kills its first worker. Workers import this module."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from topoloc.mapping.build import Progress
 
 @dataclass(frozen=True, eq=False)
 class DyingPiece(Piece):
-    """Leaves a file beside the recording, and is killed, unless that is there."""
+    """Kill the worker at the first run, and leave a file beside the recording as a mark."""
 
     def run(self, progress: Progress) -> PieceAnswers:
         begun = Path(f"{self.recording.path}.begun-{self.frames[0]}")

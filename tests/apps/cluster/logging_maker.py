@@ -1,5 +1,5 @@
-"""Makes a recording's map as `topoloc build` does, and writes down who began it, and who finished
-it."""
+"""Make the map of a recording as `topoloc build` does, and log when each attempt
+begins and ends."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @dataclass(frozen=True)
 class LoggingMaker:
-    """`seconds` pass after a map was begun for the first time, so that its worker can be killed in
-    the middle."""
+    """Wait `seconds` at the first attempt, so that a test can kill the worker before the
+    map is complete."""
 
     making: MapJob
     log: str

@@ -1,4 +1,4 @@
-"""Jobs of a moment, for the runner alone; workers import this module."""
+"""Define short jobs for tests of the runner. Workers import this module."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from topoloc.mapping.build import Progress
 
 @dataclass(frozen=True)
 class Noting:
-    """Writes when it began and ended; `does` says what else."""
+    """Log the begin and the end of the job. `does` selects an error or the end of the process."""
 
     number: int
     log: str

@@ -1,4 +1,5 @@
-"""Atlases built on a cluster of two nodes: the same maps as one by one, whoever dies."""
+"""Check that an atlas built on a cluster of two nodes has the same maps, even if
+workers are killed."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ Complaint = Callable[..., str]
 
 @pytest.fixture(scope="module")
 def one_by_one(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The recordings' map files by the plain command."""
+    """Return the bytes of each recording's map, built by the plain command."""
     folder = tmp_path_factory.mktemp("alone")
     for walk in walks:
         assert main(["build", str(walk), str(folder / f"{walk.name}.topo")]) == 0
@@ -49,7 +50,7 @@ def _maps(where: str) -> dict[str, bytes]:
 
 
 def _litter(atlas: Path, scratch: Path) -> list[str]:
-    """What no manifest names, and what workers left."""
+    """Return files that no manifest names, and files that workers left."""
     named = Atlas.open(str(atlas)).manifest.files | {"atlas.json", ".atlas.lock"}
     found = {path.relative_to(atlas).as_posix() for path in atlas.rglob("*") if path.is_file()}
     return sorted(found - named) + [path.name for path in scratch.rglob("*topoloc*")]
@@ -73,7 +74,7 @@ def test_the_same_maps_as_one_by_one(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):
-    """Also: what cannot be mapped is told and left out, and what is there is not made again."""
+    """A recording without a map is reported and skipped. Existing maps are not built again."""
     atlas, broken = tmp_path / "campus", tmp_path / "broken"
     broken.mkdir()
     built = _built(capsys, 1, walks[0], broken, *walks[1:], atlas, "--ray", cluster.address)
@@ -228,7 +229,7 @@ def test_an_atlas_in_an_object_store(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """A store of local files stands for one: folders appear as in a store of objects."""
+    """A store of local files stands in for an object store. It creates folders in the same way."""
     pytest.importorskip("obstore", reason="obstore is not installed (the extra cluster)")
     where = f"file://{tmp_path}/bucket/campus"
     jobs = _jobs(walks, tmp_path / "log", 0.0)

@@ -1,5 +1,4 @@
-"""Tiles joined and updated on a cluster of two nodes: what is there afterwards is what one machine
-alone makes."""
+"""Check that a cluster of two nodes joins and updates tiles exactly as one machine does."""
 
 from __future__ import annotations
 
@@ -21,8 +20,8 @@ from topoloc.recordings.open import open_sequence
 
 @pytest.fixture(scope="module")
 def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An atlas of two pieces of one walk that share three pairs, and of another room; not to be
-    written to."""
+    """Return an atlas of two pieces of one walk, which share three pairs, and another
+    room. Read-only."""
     folder = tmp_path_factory.mktemp("pieces")
     walk = write_stereo_recording(folder / "walk", 1, [float(k) for k in range(9)])
     other = write_stereo_recording(folder / "other", 3, [0.0, 2.0, 4.0, 6.0, 8.0])
@@ -44,7 +43,7 @@ def _said(capsys: pytest.CaptureFixture[str], status: int, *args: object) -> dic
 
 
 def _manifest(where: Path) -> dict[str, Any]:
-    """What it says, but for its number and the times of files that were given up."""
+    """Return the manifest without its serial number and the times of retired files."""
     data = json.loads((where / "atlas.json").read_bytes())
     return data | {"serial": 0, "retired": sorted(data["retired"])}
 
@@ -60,7 +59,7 @@ def _maps(where: Path) -> dict[str, bytes]:
 def test_pairs_are_joined_as_on_one_machine(
     cluster: Any, pieces: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Also: what is joined is not compared again, so that a driver that was killed goes on."""
+    """Joined pairs are not compared again, so that a killed driver can continue."""
     settings = tmp_path / "all.toml"
     settings.write_text(
         "[join]\nmin_likeness = -1.0\nnum_probed = 2\n"
@@ -90,7 +89,7 @@ def test_a_pair_whose_worker_ended_is_told(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """It is a failure, and no refusal; the others stand."""
+    """The pair is a failure, not a refusal. The results of other pairs stay."""
     import topoloc.apps.cluster.tasks as tasks
 
     def half_lost(jobs: Any, address: str, *args: object) -> list[Any]:
@@ -117,8 +116,8 @@ def test_recordings_join_their_tiles_as_on_one_machine(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """Two of one tile one after the other, one of another tile beside them, one of elsewhere; and
-    again."""
+    """Two recordings of one tile run in order, one of another tile in parallel. One shows
+    another place."""
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
     rows = {
         "noon": (1, 0.3, 8.3),

@@ -1,4 +1,4 @@
-"""Which clusters can be reached, and how it is said of those that cannot. None is started here."""
+"""Test cluster addresses: which are valid, and the errors of the others. No cluster is started."""
 
 from __future__ import annotations
 

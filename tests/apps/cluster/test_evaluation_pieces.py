@@ -1,4 +1,5 @@
-"""Evaluation on a cluster of two nodes: the figures, words and failures of the plain command."""
+"""Check that an evaluation on two nodes has the figures, texts and failures of the
+plain command."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ Complaint = Callable[..., str]
 
 @pytest.fixture
 def queried_map(room_map: Path, queries: Path, tmp_path: Path) -> Path:
-    """A folder with `room.topo`, `pictures` of the room and pictures of `elsewhere`, to be
-    broken."""
+    """Return a folder with `room.topo`, images of the room and of `elsewhere`, which a
+    test may damage."""
     shutil.copy(room_map, tmp_path / "room.topo")
     shutil.copytree(queries, tmp_path / "pictures")
     write_pictures(tmp_path / "elsewhere", unseen_views(seed=1, step=4.0))
@@ -48,7 +49,7 @@ def _timeless(value: Any) -> Any:
 
 
 def _evaluated(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[Any, str]:
-    """The JSON without times, and what is said on standard error."""
+    """Return the JSON without times, and the standard error."""
     capsys.readouterr()
     assert main(["evaluate", *map(str, args), "--json", "-"]) == 0
     printed = capsys.readouterr()
@@ -61,8 +62,8 @@ def test_the_same_figures_whoever_dies(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """Paths begin in the folder of the command; the pictures of a page are read where it is
-    written."""
+    """Relative paths start at the folder of the command. The report reads its images
+    on the driver."""
     monkeypatch.setattr(remote_queries, "MAX_IMAGES", 2)
     monkeypatch.setattr(remote_queries, "Piece", DyingPiece)
     monkeypatch.chdir(queried_map)
@@ -83,7 +84,7 @@ def test_the_same_figures_whoever_dies(
 def test_an_atlas_and_a_tile_that_cannot_be_read(
     cluster: Any, queried_map: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]
 ):
-    """What is wrong with a tile is said once, however many pieces meet it."""
+    """The fault of a tile is printed once, even if several pieces find it."""
     assert main(["build", str(walks[0]), str(queried_map / "other.topo")]) == 0
     campus = queried_map / "campus"
     create_atlas(
@@ -132,7 +133,7 @@ def test_against_itself_asks_no_cluster(room_map: Path, complaint: Complaint):
 
 @pytest.fixture
 def piece(queried_map: Path) -> Piece:
-    """All pictures of the room, as they are sent to a machine."""
+    """Return all images of the room as one piece that is sent to a machine."""
     topomap = TopoMetricMap.load(queried_map / "room.topo")
     recording = QueryRecording(str(queried_map / "pictures"), label="walk")
     sent = RemoteMap.of(Localizer(topomap), "", None)

@@ -1,5 +1,4 @@
-"""Long recordings mapped in pieces: which frames, called what, in which world, and joined by the
-frames that two have."""
+"""Test long recordings mapped in pieces: frames, names, worlds, and joins by shared frames."""
 
 from __future__ import annotations
 

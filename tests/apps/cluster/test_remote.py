@@ -1,4 +1,4 @@
-"""What a task does before and beside its work; no cluster is needed for it."""
+"""Test the preparation of a task on a worker. No cluster is needed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from topoloc.errors import ClusterError, RecordingError
 
 @dataclass(frozen=True)
 class Witness:
-    """Makes nothing, and tells by its error where it was asked and how."""
+    """Make no map, and raise an error that shows the folder and the environment of the call."""
 
     def make(self, progress: object):
         raise RecordingError(
@@ -37,7 +37,7 @@ class Witness:
 
 @pytest.fixture
 def undone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A task changes its process: folder, environment, threads."""
+    """Restore the folder, environment and threads of the process, which a task changes."""
     monkeypatch.chdir(".")
     for name in ("SOURCE_DATE_EPOCH", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         monkeypatch.setenv(name, os.environ.get(name, "1"))

@@ -1,4 +1,4 @@
-"""Jobs of any kind on a cluster of two nodes."""
+"""Test jobs of any kind on a cluster of two nodes."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def test_each_failure_is_that_of_its_job(cluster: Any, tmp_path: Path):
 
 
 def test_jobs_of_one_line_are_done_one_after_the_other(cluster: Any, tmp_path: Path):
-    """Also where the one before has failed; another line goes beside. Inside of a block all is one
-    connection."""
+    """A failed job does not stop its line, and lines run in parallel. One connection
+    serves the block."""
     does = ("nothing", "die", "nothing", "nothing")
     lines = ("a", "a", "b", "a")
     logs = {line: tmp_path / line for line in lines}

@@ -1,4 +1,4 @@
-"""Recordings as tiles, without a cluster."""
+"""Test the conversion of recordings to tiles without a cluster."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @dataclass(frozen=True)
 class Copied:
-    """A map that is there already stands for one that is made; `fails` is raised instead."""
+    """Return an existing map instead of building one. If `fails` is set, raise it."""
 
     path: str
     digits: str = "ab"

@@ -1,4 +1,4 @@
-"""Each form of export, read by the program that it is for."""
+"""Check each export format with the program that reads it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ print(json.dumps({"images": images, "rgb": rgb, "tracks": tracks, "num_rigs": mo
 
 @pytest.fixture(scope="module")
 def placed_map(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The room's map, somewhere on earth."""
+    """Return the room's map with a place on earth."""
     path = Path(shutil.copy(room_map, tmp_path_factory.mktemp("placed") / "room.topo"))
     assert main(["georeference", str(path), "--origin", PLACE]) == 0
     return path
@@ -53,7 +53,7 @@ def placed_map(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture(scope="module")
 def results(placed_map: Path, queries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The answers to the queries, and one refusal."""
+    """Return the results of the queries and one refusal."""
     path = tmp_path_factory.mktemp("results") / "results.jsonl"
     assert main(["localize", str(placed_map), str(queries), "--json", str(path)]) == 0
     return path
@@ -71,7 +71,8 @@ def export(source: Path, out: Path, *options: str) -> Path:
 
 
 def colmap_of(folder: Path) -> dict:
-    """What pycolmap reads; in a process of its own, for it and OpenCV do not get on."""
+    """Return the model as pycolmap reads it. It runs in its own process, because it
+    conflicts with OpenCV."""
     done = subprocess.run(
         [sys.executable, "-c", READ_COLMAP, str(folder)],
         capture_output=True,

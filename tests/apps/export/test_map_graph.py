@@ -1,4 +1,4 @@
-"""A map's graph as GraphML and GeoJSON: as other programs read it, and true to the map."""
+"""Test a map's graph as GraphML and GeoJSON: other programs read it, and it matches the map."""
 
 from __future__ import annotations
 

@@ -1,3 +1,3 @@
-"""The fixtures of tiny recordings."""
+"""Import the fixtures of tiny recordings."""
 
 from recording_fixtures import *  # noqa: F403

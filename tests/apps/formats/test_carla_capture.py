@@ -1,4 +1,5 @@
-"""CARLA: axes by its own client's transforms, and a way recorded from a stand-in of its server."""
+"""Test recording from CARLA: axes as in its client's transforms, and a route with a
+stand-in server."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ carla: Any = pytest.importorskip("carla", reason="CARLA's client (extra carla) i
 
 
 def ours(vector: Any) -> np.ndarray:
-    """A vector of CARLA's world in ours."""
+    """Convert a vector from CARLA's world axes to ours."""
     return np.array([vector.x, -vector.y, vector.z])
 
 
@@ -49,8 +50,7 @@ def test_axes_are_those_of_the_client(angles: tuple[float, float, float]):
 
 
 def test_points_in_front_of_a_camera_are_where_carla_has_them():
-    """A point that `carla.Transform` takes from the camera's frame (forward, right, up) to the
-    world."""
+    """`carla.Transform` maps a point from the camera frame (forward, right, up) to the world."""
     transform = carla.Transform(
         carla.Location(-20.0, 4.0, 1.6), carla.Rotation(pitch=-4.0, yaw=135.0, roll=2.0)
     )
@@ -63,7 +63,7 @@ def test_points_in_front_of_a_camera_are_where_carla_has_them():
 
 
 class StandInSensor:
-    """Sees its own number in blue, the step in green, and x of its place in red."""
+    """Render images whose blue is the sensor number, green the step, and red the x of its place."""
 
     def __init__(self, number: int) -> None:
         self.number, self.listener, self.transform, self.ended = number, None, carla.Transform(), []
@@ -82,7 +82,8 @@ class StandInSensor:
 
 
 class StandInWorld:
-    """A lane along CARLA's y, straight on at a junction 5 m on, with an end after 9 m."""
+    """Simulate a lane along CARLA's y: straight on at a junction after 5 m, with an
+    end after 9 m."""
 
     def __init__(self, num_silent: int = 10**6, late: int = 0) -> None:
         self.sensors: list[StandInSensor] = []

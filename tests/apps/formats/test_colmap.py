@@ -1,4 +1,4 @@
-"""COLMAP's models, written by pycolmap, as recordings of single pictures."""
+"""Test COLMAP models, written by pycolmap, as recordings of single images."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ METRES = 2.5
 
 
 def true_pose(index: int) -> Rigid3:
-    """Along a bend."""
+    """Return the true pose of an image along a bend."""
     return Rigid3(
         pose(index).rotation, pose(index).translation + np.array([0.0, 0.0, 0.3 * index**2])
     )
@@ -53,8 +53,8 @@ def true_pose(index: int) -> Rigid3:
 
 @pytest.fixture
 def model(tmp_path: Path) -> Make:
-    """Makes sparse/0 and images/ of three pictures, in a unit of 2.5 m; `changes` are those of the
-    camera."""
+    """Return a function that writes sparse/0 and images/ of three images, in a unit of 2.5 m.
+    `changes` alter the camera."""
 
     def make(
         binary: bool = True,
@@ -120,7 +120,7 @@ def test_pictures_cameras_and_poses(model: Make, binary: bool):
 @pytest.mark.parametrize("orientation", [3, 6])
 @pytest.mark.parametrize("is_of_turned", [False, True])
 def test_images_are_read_as_stored(model: Make, orientation: int, is_of_turned: bool):
-    """COLMAP ignores the EXIF orientation. A model of turned images shows it by the size."""
+    """COLMAP ignores the EXIF orientation. The image size shows if a model uses rotated images."""
     size = {"width": HEIGHT, "height": WIDTH} if is_of_turned and orientation == 6 else {}
     root, exif = model(**size), PIL.Image.Exif()
     exif[0x0112] = orientation

@@ -1,4 +1,4 @@
-"""COLMAP's database, written by pycolmap, as a recording of single pictures without poses."""
+"""Test a COLMAP database, written by pycolmap, as a recording of single images without poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ Make = Callable[..., Path]
 
 @pytest.fixture
 def database(tmp_path: Path) -> Make:
-    """Makes database.db and images/; each picture's camera is the one of its place, or the last."""
+    """Return a function that writes database.db and images/. Image k uses camera k,
+    or the last one."""
 
     def make(
         names: tuple[str, ...] = ("10.png", "9.5.png", "11.png"), cameras: tuple = (OPENCV,)

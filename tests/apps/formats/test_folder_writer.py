@@ -1,4 +1,4 @@
-"""Frames written as they come are the recording that is read."""
+"""Check that frames written one by one can be read as a recording."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Live sources: a stream over HTTP from this machine, a video file taken for one; old pictures are
-dropped, ends and stalls are said."""
+"""Test live sources, such as a local HTTP stream or a video file: old images are dropped, and ends
+and stalls are reported."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from topoloc.errors import RecordingError
 
 
 def grey_film(path: Path, num_frames: int) -> Path:
-    """Frame k is of grey 10 k."""
+    """Write a video whose frame k has grey 10 k."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 30.0, (64, 48))
     for index in range(num_frames):
         writer.write(np.full((48, 64, 3), 10 * index, np.uint8))
@@ -25,7 +25,7 @@ def grey_film(path: Path, num_frames: int) -> Path:
 
 
 def greys(num_pictures: int) -> list[np.ndarray]:
-    """Picture k is of grey 10 k, up to white."""
+    """Return images. Image k has grey 10 k, up to white."""
     return [np.full((48, 64, 3), min(10 * index, 255), np.uint8) for index in range(num_pictures)]
 
 
@@ -63,8 +63,7 @@ def test_every_picture_of_a_source_that_may_wait(tmp_path: Path):
 
 
 def test_the_newest_picture_of_a_stream_over_http():
-    """Who takes longer than the camera's period gets pictures that are new all the same, and the
-    last one."""
+    """A reader slower than the camera still gets new images, and the last one."""
     with mjpeg_camera(greys(20), 0.02) as url, LiveSource(url) as source:
         taken = []
         for picture in source:

@@ -1,4 +1,4 @@
-"""The unit of a model, by a number or by measured distances."""
+"""Test the metric scale of a model, given as a number or by measured distances."""
 
 from __future__ import annotations
 

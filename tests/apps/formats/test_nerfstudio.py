@@ -1,5 +1,5 @@
-"""transforms.json as nerfstudio documents it, written by hand here: its converters' shape,
-Polycam's, and what is hostile."""
+"""Test transforms.json as Nerfstudio documents it: files as its converters and Polycam write them,
+and hostile files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ Make = Callable[..., Path]
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Make:
-    """Makes a folder of three frames; `change` may alter what its transforms.json says."""
+    """Return a function that writes a folder of three frames. `change` may alter its
+    transforms.json."""
 
     def make(
         change: Callable[[dict[str, Any]], None] | None = None, depth_scale: float | None = 0.001

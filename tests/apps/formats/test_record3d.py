@@ -1,4 +1,4 @@
-"""Record3D's export by its published shape; EXR files are written by the format's own library."""
+"""Test Record3D's export in its published format. The format's own library writes the EXR files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ needs_exr = pytest.mark.skipif(
 
 
 def _arkit_row(world_from_cam: Rigid3) -> list[float]:
-    """qx qy qz qw tx ty tz with ARKit's camera axes: y up, z back."""
+    """Return qx qy qz qw tx ty tz with ARKit's camera axes: y up, z back."""
     arkit = Rigid3(world_from_cam.rotation @ np.diag([1.0, -1.0, -1.0]), world_from_cam.translation)
     w, x, y, z = arkit.quat_wxyz()
     return [x, y, z, w, *arkit.translation]

@@ -1,5 +1,5 @@
-"""Two distorted cameras in camera.json, OpenCV's YAML (written by OpenCV), Kalibr's camchain, and
-four numbers."""
+"""Test calibrations of two distorted cameras: camera.json, YAML written by OpenCV, Kalibr's
+camchain, and four numbers."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def write_opencv(
 
 @pytest.fixture
 def pairs(tmp_path: Path) -> Path:
-    """Three pairs without a calibration."""
+    """Return a folder with three stereo pairs and no calibration."""
     for index in range(3):
         write(tmp_path / "pairs" / "left" / f"{index}.png", picture(index))
         write(tmp_path / "pairs" / "right" / f"{index}.png", picture(10 + index))
@@ -117,7 +117,7 @@ def test_what_opencv_writes(pairs: Path):
 
 
 def test_opencvs_two_files(pairs: Path, tmp_path: Path):
-    """Its stereo sample writes the cameras into intrinsics.yml and how they stand into
+    """OpenCV's stereo sample writes cameras to intrinsics.yml and their transform to
     extrinsics.yml."""
     whole = write_opencv(tmp_path / "whole.yml").read_text()
     (pairs / "intrinsics.yml").write_text(whole[: whole.index("\nR:")] + "\n")
@@ -182,7 +182,7 @@ projection_matrix:
 
 @pytest.mark.parametrize("given", [False, True])
 def test_the_two_files_of_ros(pairs: Path, given: bool):
-    """As its cameracalibrator writes them: the baseline stands in P of the right camera."""
+    """ROS's cameracalibrator stores the baseline in P of the right camera."""
     rotation, translation = RIGHT_FROM_LEFT.rotation, RIGHT_FROM_LEFT.translation[:, None]
     cameras = (LEFT, RIGHT)
     matrices = [(camera.matrix(), camera.distortion()[:5]) for camera in cameras]
@@ -258,7 +258,7 @@ def test_broken_opencv(pairs: Path, tmp_path: Path):
 
 
 class TestCameraOption:
-    """A calibration instead of the recording's own."""
+    """Test a calibration that replaces the recording's own."""
 
     def test_of_a_rectified_pair_the_baseline_stays(self, kitti: Path):
         frame = open_sequence(kitti, camera="45,46,16,12")[0]
@@ -335,8 +335,8 @@ class TestCameraOption:
 
 
 def test_a_distorted_pair_is_rectified_to_what_the_calibration_says():
-    """A point seen by the raw cameras is seen at equal rows, and as far apart as its depth says, by
-    the rectified ones."""
+    """Rectified cameras see a point of the raw cameras in equal rows, at the
+    disparity of its depth."""
     from topoloc.geometry.rig import rectify
 
     rig = StereoRig(LEFT, RIGHT, RIGHT_FROM_LEFT)

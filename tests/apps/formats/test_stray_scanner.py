@@ -1,4 +1,4 @@
-"""Folders of Stray Scanner, written by hand here."""
+"""Test folders of Stray Scanner, which the tests write themselves."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def row(index: int, *more: float) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Four frames with depth of a quarter of the size; a corner has no confidence."""
+    """Write four frames. Depth has a quarter of the image size, and one corner has
+    no confidence."""
     root = tmp_path / "scan"
     root.mkdir()
     fourcc = cv2.VideoWriter_fourcc(*"mp4v")  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,5 +1,4 @@
-"""SVO files: what is said without Stereolabs' SDK, and the calls of it that are made, on a stand-in
-of its names."""
+"""Test SVO files: the error without Stereolabs' SDK, and the SDK calls with a stand-in module."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ NUM_FRAMES = 4
 
 
 class StandInCamera:
-    """Frames whose grey is their number; the right ones 100 brighter."""
+    """Return frames whose grey is their number. The right images are 100 brighter."""
 
     position = 0
 

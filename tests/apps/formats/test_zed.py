@@ -1,5 +1,5 @@
-"""Side-by-side video with Stereolabs' calibration: halves, resolutions, rectification as
-Stereolabs' own, and what is wrong with it."""
+"""Test side-by-side video with a Stereolabs calibration: halves, resolutions,
+rectification and faults."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CONF = f"[LEFT_CAM_VGA]\n{LEFT}\n[RIGHT_CAM_VGA]\n{RIGHT}\n[LEFT_CAM_HD]\n{LEFT}
 
 
 def write_side_by_side(path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    """Without loss."""
+    """Write a lossless side-by-side video."""
     height, width = pairs[0][0].shape[:2]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 15.0, (2 * width, height))
     assert writer.isOpened()
@@ -42,7 +42,7 @@ def write_side_by_side(path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]) -
 
 @pytest.fixture
 def film(tmp_path: Path) -> Path:
-    """Three pairs of VGA, with their calibration beside them."""
+    """Return a video of three VGA pairs, with its calibration beside it."""
     rng = np.random.default_rng(5)
     pairs = [
         tuple(np.full((376, 672, 3), int(grey), np.uint8) for grey in rng.integers(0, 256, 2))
@@ -70,7 +70,8 @@ def test_halves_are_left_and_right(film: Path):
 
 
 def test_a_real_recording_side_by_side(shared: Path, tmp_path: Path):
-    """Rectified pairs with a calibration that says so; poses beside the video, at its times."""
+    """The pairs are rectified, and so is the calibration. Poses lie beside the video,
+    with its times."""
     lab = open_sequence(shared / "data/zed_lab/session1@0:60:20")
     frames = [lab[index] for index in range(3)]
     path = write_side_by_side(
@@ -106,7 +107,7 @@ def test_a_real_recording_side_by_side(shared: Path, tmp_path: Path):
 
 
 def test_rectified_as_stereolabs_do(tmp_path: Path):
-    """Their samples give OpenCV's stereoRectify the rotation (RX, CV, RZ) and the translation
+    """Stereolabs' samples call stereoRectify with rotation (RX, CV, RZ) and translation
     (Baseline, TY, TZ)."""
     (tmp_path / "SN1.conf").write_text(CONF)
     rig = read_conf(tmp_path / "SN1.conf", VGA)

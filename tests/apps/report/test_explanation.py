@@ -1,4 +1,4 @@
-"""What is said of an answer, or of none."""
+"""Test the explanation of a localized or refused image."""
 
 import json
 import re
@@ -37,7 +37,7 @@ def test_an_answer_is_among_what_was_tried(localizer: Localizer, queries: Path):
 
 
 def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):
-    """Where no evidence is enough, all that looks alike is asked, and leads to the same pose."""
+    """If no evidence suffices, each similar place is tried and leads to the same pose."""
     weights = load_fitted_weights("surf")
     weights = replace(weights, evidence=structs.replace(weights.evidence, clear_log_odds=1e9))
     never_clear = Localizer(localizer.topomap, weights=weights)

@@ -1,5 +1,5 @@
-"""What is drawn between a query and its node is what the map and the camera say, and leads to the
-right pixels."""
+"""Check that drawn matches between a query and its node agree with map and camera and end at
+the right pixels."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def topomap(tiny_recording: Path) -> TopoMetricMap:
 def _seen_in_node(
     topomap: TopoMetricMap, node_id: int, matches: NodeMatches, world_from_cam: Rigid3
 ) -> np.ndarray:
-    """How far, in the query, each matched node point lies from where the true pose says, pixels."""
+    """Return the distance in pixels, in the query, of each matched node point from its
+    true projection."""
     node = topomap.nodes[node_id]
     rows = [
         int(np.argmin(np.linalg.norm(node.features.points_img - pixel, axis=1)))

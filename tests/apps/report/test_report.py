@@ -1,5 +1,5 @@
-"""The page of an evaluation: whole, self-contained, the same twice, and right about what was
-worst."""
+"""Test the page of an evaluation: complete, self-contained, deterministic, with the right
+worst queries."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The report in a real browser: it holds the scene, nothing is cut off on a phone, and it can be
-read by light and by dark."""
+"""Test the report in a real browser: the 3-D scene, a narrow screen, and light and dark colours."""
 
 from __future__ import annotations
 
@@ -75,7 +74,7 @@ def test_the_scene_holds_every_answer(browser: Any, report: Path):
 
 
 def test_the_page_scrolls_over_the_scene(browser: Any, report: Path):
-    """The wheel belongs to the page until the scene has the focus."""
+    """The mouse wheel scrolls the page until the scene has the focus."""
     stage = "document.querySelector('[data-scene]').viewer.stage"
     distance = f"{stage}.camera.position.distanceTo({stage}.controls.target)"
     with opened(browser, report.as_uri(), 1300) as page:

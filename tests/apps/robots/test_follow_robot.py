@@ -1,4 +1,4 @@
-"""`topoloc follow --ros` as a user types it, beside a robot that drives in real time."""
+"""Test `topoloc follow --ros` as a user types it, beside a robot that drives in real time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _dark(place: float) -> np.ndarray:
 def _drive(
     start: float, end: float, picture: Callable[[float], np.ndarray] = _picture
 ) -> list[Step]:
-    """Two centimetres an image."""
+    """Return the steps of a drive at two centimetres per image."""
     places = np.arange(start, end, 0.15 if end > start else -0.15)
     return [Step(path_pose(place), picture(place)) for place in places.tolist()]
 
@@ -56,7 +56,7 @@ def _start(robot: PlayedRobot, step: Step) -> None:
 
 
 def _levels(robot: PlayedRobot, steps: Sequence[int]) -> set[int]:
-    """Levels of /diagnostics between two steps."""
+    """Return the levels of /diagnostics between two steps."""
     first, last = (robot.start_ns + round(step * 1e9 / robot.hz) for step in steps)
     return {level for at, level, _, _ in robot.heard.statuses if first <= at <= last}
 
@@ -64,7 +64,7 @@ def _levels(robot: PlayedRobot, steps: Sequence[int]) -> set[int]:
 def test_tf_is_right_through_wrong_images_darkness_and_a_kidnapping(
     robot: PlayedRobot, room_map: Path
 ):
-    """The bounds leave room for a busy machine. benchmarks/robot_simulation.py prints figures."""
+    """The bounds allow for a busy machine. benchmarks/robot_simulation.py prints figures."""
     steps = _drive(1.0, 4.0)
     steps += _drive(4.0, 5.2, lambda place: _picture(place + 6.0))  # for 0.8 s another place
     steps += _drive(5.2, 7.0)
@@ -151,8 +151,8 @@ def test_without_odometry_tf_is_that_of_the_camera(robot: PlayedRobot, room_map:
 def test_tf_is_right_in_the_demos_lab_and_in_a_real_kitchen(
     request: pytest.FixtureRequest, place: str, tmp_path: Path
 ):
-    """The lab in its own time, two images a second and 0.26 m apart. The kitchen of 7-Scenes, whose
-    truth is that of a tracker; one frame in four is mapped, and others are played."""
+    """The lab plays at two images per second, 0.26 m apart. The kitchen of 7-Scenes has ground
+    truth from a tracker. One frame in four is mapped, and others are played."""
     if place == "lab":
         mapped = [str(SHIPPED / "map_lap1"), str(SHIPPED / "map_lap2")]
         played, hz = str(SHIPPED / "day"), 1.92

@@ -1,4 +1,4 @@
-"""The gate: what moves the transform from map to odom, and what does not."""
+"""Test the health gate: which evidence changes the transform from map to odom."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ AWAY = Rigid3.exp(np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.1]))
 def _evidence(
     t_s: float, wrong: Rigid3 | None = None, is_localized: bool = True, drift: float = 0.0
 ) -> Evidence:
-    """The robot drives half a metre a second; `drift` are metres by which its odometry is off."""
+    """Return evidence at a time. The robot drives 0.5 m/s, and its odometry is off by
+    `drift` metres."""
     way = 0.5 * t_s
     odom_from_cam = Rigid3.exp(np.array([way + drift, 0.0, 0.3, 0.0, 0.0, 0.0]))
     truth = MAP_FROM_ODOM @ Rigid3.exp(np.array([way, 0.0, 0.3, 0.0, 0.0, 0.0]))
@@ -34,7 +35,7 @@ def _verdicts(gate: HealthGate, evidence: Sequence[Evidence]) -> str:
 
 @pytest.fixture
 def gate() -> HealthGate:
-    """A gate that has found the robot in the first half second."""
+    """Return a gate that localized the robot within the first half second."""
     gate = HealthGate()
     assert _verdicts(gate, [_evidence(0.2 * k) for k in range(3)]) == "ddj"
     return gate
@@ -48,7 +49,7 @@ def test_the_first_pose_needs_several_images_that_agree():
 
 
 def test_tracked_points_confirm_no_new_place():
-    """They have the errors of the image that was localized wrongly."""
+    """Tracked points share the errors of the wrongly localized image."""
     gate = HealthGate()
     tracked = [_evidence(0.1 * k, is_localized=False) for k in range(20)]
     assert set(_verdicts(gate, [_evidence(0.0), *tracked])) == {"d"}
@@ -63,7 +64,7 @@ def test_poses_that_agree_follow_the_drift_of_odometry(gate: HealthGate):
 
 
 def test_wrong_places_do_not_move_it(gate: HealthGate):
-    """Each elsewhere, and several at one wrong place for less than a second."""
+    """Feed wrong poses at random places, then several at one wrong place for less than a second."""
     rng = np.random.default_rng(0)
     everywhere = [_evidence(0.5 + 0.1 * k, Rigid3.exp(rng.normal(0.0, 1.0, 6))) for k in range(50)]
     assert set(_verdicts(gate, everywhere)) == {"d"}
@@ -85,7 +86,7 @@ def test_a_jump_is_believed_after_a_second_of_images_that_agree(gate: HealthGate
 
 
 def test_a_robot_that_stands_waits_longer(gate: HealthGate):
-    """Its images are the same, and so are their errors."""
+    """A robot at rest sees equal images with equal errors."""
     first = _evidence(1.0, AWAY)
     standing = [replace(first, t_ns=first.t_ns + 200_000_000 * k) for k in range(27)]
     verdicts = _verdicts(gate, standing)
@@ -93,7 +94,7 @@ def test_a_robot_that_stands_waits_longer(gate: HealthGate):
 
 
 def test_images_that_odometry_contradicts_confirm_no_jump(gate: HealthGate):
-    """A place that slides by a metre a second, while the wheels say half of it."""
+    """The pose moves at 1 m/s, and wheel odometry measures half of it."""
     sliding = [
         _evidence(1.0 + 0.2 * k, Rigid3(np.eye(3), np.array([0.1 * k + 1.0, 1.0, 0.0])))
         for k in range(20)
@@ -102,7 +103,7 @@ def test_images_that_odometry_contradicts_confirm_no_jump(gate: HealthGate):
 
 
 def test_after_a_long_way_in_the_dark_the_drift_is_no_jump(gate: HealthGate):
-    """20 metres at five per cent: a metre is one sigma."""
+    """After 20 metres with a drift of five per cent, one metre is one sigma."""
     assert _verdicts(gate, [_evidence(40.0, drift=1.0)]) == "f"
     assert _verdicts(HealthGate(), [_evidence(40.0, drift=1.0)]) == "d"
 

@@ -1,4 +1,5 @@
-"""The published transform: smooth about the robot, or at once; the plane."""
+"""Test the published transform: smooth correction about the robot, immediate correction,
+and planar mode."""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ ODOM_FROM_BASE = Rigid3.exp(np.array([20.0, 0.0, 0.0, 0.0, 0.0, 0.2]))
 
 
 def _moved(xi: list[float]) -> Rigid3:
-    """map_from_base after a correction of the robot, in its own axes."""
+    """Return map_from_base after a correction of the robot in its own axes."""
     return ODOM_FROM_BASE @ Rigid3.exp(np.array(xi))
 
 
 def test_corrections_move_the_robot_no_faster_than_allowed():
-    """A correction of 10 cm and 0.1 rad of a robot 20 m from the origin of odom: a turn about that
-    origin would swing it by two metres."""
+    """The robot is 20 m from the origin of odom and is corrected by 10 cm and 0.1 rad. A rotation
+    about that origin would move it by two metres."""
     followed = MapToOdom(speed=0.2, turn_rate=0.5)
     assert followed.advance(5.0) is None
     followed.set_target(ODOM_FROM_BASE, ODOM_FROM_BASE, at_once=False)

@@ -1,5 +1,5 @@
-"""Frames of MAVLink are those of pymavlink 2.4.50, byte for byte; axes and angles are those of an
-autopilot."""
+"""Check that MAVLink frames equal pymavlink 2.4.50 byte for byte, in the axes and angles
+of an autopilot."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _pose(rotation: np.ndarray, *position: float) -> Rigid3:
 
 
 def _about_origin(pose: Rigid3, covariance: np.ndarray) -> np.ndarray:
-    """The covariance of the left perturbation, from that about the body."""
+    """Return the covariance of the left perturbation, given the covariance about the body."""
     return Rigid3(np.eye(3), pose.translation).transform_covariance(covariance)
 
 
@@ -112,7 +112,7 @@ def test_pymavlink_reads_them(number: int):
 
 
 def _sent(pose: Rigid3, covariance: np.ndarray | None = None) -> tuple[np.ndarray, Rigid3]:
-    """What an autopilot reads: the covariance, and the pose in axes forward, right and down."""
+    """Return the covariance and the pose (forward, right, down) that an autopilot reads."""
     payload = encode_odometry(0, pose, _NONE if covariance is None else covariance, 0.5, 0)
     numbers = np.frombuffer(payload[8:228], "<f4").astype(float)
     upper = np.zeros((6, 6))
@@ -144,14 +144,15 @@ def test_turns_are_those_of_an_aircraft(
 
 
 def test_a_camera_that_looks_forward_is_a_level_body():
-    """It looks along x of the map: its right is -y, its down -z."""
+    """The camera looks along x of the map: its right is -y, its down -z."""
     looks_forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     body = body_of_forward_camera(_pose(looks_forward, 4.0, 5.0, 6.0))
     assert body.is_same(_pose(np.eye(3), 4.0, 5.0, 6.0), 1e-12, 1e-12)
 
 
 def test_the_covariance_is_that_of_poses_drawn_from_it():
-    """Drawn as `Localization` says, sent, and measured about the body in the autopilot's axes."""
+    """Draw poses from the covariance of `Localization`, send them, and measure them about the body
+    in autopilot axes."""
     pose = _pose(exp_so3(np.array([0.2, -0.4, 1.1])), 5.0, -3.0, 2.0)
     sigmas = np.array([0.02, 0.03, 0.01, 0.004, 0.002, 0.006])
     mixed = np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))[0]
@@ -225,7 +226,8 @@ def test_a_host_that_is_unknown_is_named():
 
 
 def _received(receiver: socket.socket) -> list[tuple[int, np.ndarray, int]]:
-    """Time (microseconds), position (forward, right, down) and reset counter of what came."""
+    """Return time (microseconds), position (forward, right, down) and reset counter of each
+    received message."""
     receiver.settimeout(0.3)
     found = []
     with suppress(TimeoutError):

@@ -1,4 +1,4 @@
-"""What /diagnostics says, and whose time it is."""
+"""Test the messages of /diagnostics and the choice of the clock."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_fault_is_named_as_long_as_it_lasts():
 
 
 def test_slow_answers_are_no_other_clock():
-    """The shortest delay counts."""
+    """The shortest delay decides."""
     clock = RobotClock(max_offset=0.5)
     for delay in (3.0, 2.0, 0.1, 2.0):
         clock.observe(time.time_ns() - round(delay * 1e9))

@@ -1,4 +1,4 @@
-"""What a robot's localizer publishes for each answer of a stream, without a network."""
+"""Test the messages that a robot's localizer publishes for a stream, without a network."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BASE_FROM_CAM = Rigid3.exp(np.array([0.2, 0.0, 0.5, -1.57, 0.0, 0.0]))
 
 
 class Publisher(RobotPublisher):
-    """Keeps what is published."""
+    """Store the published messages."""
 
     def __init__(self, node: Any, config: RobotConfig) -> None:
         self.poses: list[tuple[int, Rigid3]] = []
@@ -48,7 +48,7 @@ class Publisher(RobotPublisher):
 
 
 class Node(RosNode):
-    """Keeps the callbacks of the topics."""
+    """Store the callbacks of the topics."""
 
     publisher: Publisher
 
@@ -79,7 +79,7 @@ def _message(t_ns: int, parent: str, pose: Rigid3, child: str = "") -> SimpleNam
 
 
 class Robot:
-    """A localizer, what feeds it, and what it says. Its robot drives half a metre a second."""
+    """Hold a localizer, its inputs and its messages. The robot drives 0.5 m/s."""
 
     def __init__(self, config: RobotConfig, map_from_world: Rigid3 | None = None) -> None:
         self.warnings: list[str] = []
@@ -95,11 +95,11 @@ class Robot:
             self.node.tf(0, "base_link", "topoloc_camera", BASE_FROM_CAM, is_static=True)
 
     def base(self, number: int) -> Rigid3:
-        """odom_from_base at an image."""
+        """Return odom_from_base at an image."""
         return Rigid3.exp(np.array([0.05 * number, 0.0, 0.0, 0.0, 0.0, 0.01 * number]))
 
     def see(self, number: int, **changes: Any) -> None:
-        """Answer an image: rightly, but for what is changed."""
+        """Process an image with the right pose, except for the given changes."""
         t_ns = self.start_ns + 100_000_000 * number
         if self.has_tf:
             self.node.tf(t_ns, "odom", "base_link", self.base(number))
@@ -127,7 +127,7 @@ class _Frame(QueryFrame):
 
 
 class _Expecting(Tracker):
-    """Keeps the priors that it gets."""
+    """Store the priors that the tracker gets."""
 
     def __init__(self, expected: list[Rigid3]) -> None:
         self.expected, self.cameras = expected, cast(Any, None)
@@ -161,7 +161,7 @@ def make(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_map_to_odom_is_that_of_the_measured_poses(make: Callable[..., Robot]):
-    """In a world whose axes are not those of the robot's map."""
+    """The axes of the world differ from the axes of the robot's map."""
     robot = make(Rigid3.exp(np.array([3.0, 0.0, 1.0, 1.0, 0.5, 0.0])))
     for number in range(5):
         robot.see(number)
@@ -187,7 +187,8 @@ def test_it_is_published_between_the_images_with_stamps_that_increase(make: Call
 
 
 def test_what_is_no_evidence_is_not_published(make: Callable[..., Robot]):
-    """Predicted poses, low probabilities, repeated images and tracked points at another place."""
+    """The gate ignores predicted poses, low probabilities, repeated images and tracked points at
+    another place."""
     robot = make()
     for number in range(5):
         robot.see(number)
@@ -252,7 +253,7 @@ def test_missing_tf_is_one_warning_and_an_error_of_diagnostics(make: Callable[..
 
 @pytest.mark.parametrize("height", [0.0, float("nan"), float("inf"), -1.0])
 def test_a_pose_of_the_user_is_a_prior(make: Callable[..., Robot], height: float):
-    """Whatever its tool gives as the variance of what it does not know."""
+    """The tool may fill the variance of unknown components with any value."""
     world = Rigid3.exp(np.array([3.0, 0.0, 1.0, 1.0, 0.5, 0.0]))
     robot = make(world)
     given = MAP_FROM_ODOM @ robot.base(0)

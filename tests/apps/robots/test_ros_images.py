@@ -1,4 +1,4 @@
-"""Images of a topic: which are taken, which are counted as dropped, and their cameras."""
+"""Test images of a topic: which are used, which are counted as dropped, and their cameras."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _header(t_ms: int) -> SimpleNamespace:
 
 
 def _image(t_ms: int, pixels: np.ndarray = RGB, encoding: str = "rgb8") -> SimpleNamespace:
-    """With three bytes of padding at the end of each row."""
+    """Return an image message with three bytes of padding after each row."""
     rows = np.pad(pixels.reshape(HEIGHT, -1), ((0, 0), (0, 3)))
     return SimpleNamespace(
         header=_header(t_ms), height=HEIGHT, width=WIDTH, encoding=encoding, is_bigendian=0,

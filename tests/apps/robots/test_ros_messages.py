@@ -1,4 +1,4 @@
-"""Messages over DDS: the bytes that ROS's IDL asks for, by hand and by another implementation."""
+"""Test messages over DDS: their bytes follow ROS's IDL, by hand and by another implementation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytest.importorskip("cyclonedds", reason="the extra ros is not installed")
 
 
 def test_the_bytes_are_those_of_the_idl():
-    """CDR by hand: little endian, 8-byte numbers aligned after the encapsulation, texts with their
+    """CDR by hand: little endian, 8-byte numbers aligned after the encapsulation, strings with
     length and a zero."""
     from topoloc.apps.robots import ros_messages as ros
 
@@ -65,7 +65,7 @@ def _messages(ros: Any) -> dict[str, Any]:
     ],
 )
 def test_another_implementation_reads_and_writes_the_same_bytes(kind: str):
-    """rosbags has the definitions of ROS. A message read by it and written again is unchanged."""
+    """rosbags has the definitions of ROS. It reads a message and writes it again unchanged."""
     typesys = pytest.importorskip("rosbags.typesys", reason="the extra bags is not installed")
     from topoloc.apps.robots import ros_messages as ros
 
@@ -108,8 +108,8 @@ def test_without_a_network_one_sentence_says_so(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_damaged_message_costs_only_itself():
-    """Another participant sends bytes of another type under the same name: an image whose data are
-    as long as the text of a shorter message says."""
+    """Another participant sends another type under the same name, so that the text of a short
+    message is read as the length of image data."""
     from topoloc.apps.robots.ros_node import TopicReader
 
     class Reader:
@@ -157,8 +157,7 @@ def test_a_reader_that_hangs_ends_no_writer(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_covariances_are_about_the_robot():
-    """Perturbations by hand: draws of the left perturbation move the robot by as much as the
-    covariance about it says."""
+    """Random left perturbations move the robot by as much as the covariance about it states."""
     from topoloc.apps.robots.ros_node import covariance_about
     from topoloc.geometry.rigid import Rigid3
 

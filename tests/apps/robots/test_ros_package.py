@@ -1,4 +1,5 @@
-"""The package for ROS: its files, its parameters, and its node with classes in place of rclpy's."""
+"""Test the ROS package: its files, its parameters, and its node with stand-ins for the
+classes of rclpy."""
 
 from __future__ import annotations
 
@@ -99,7 +100,7 @@ def test_rviz_shows_the_pose_and_sets_the_initial_one():
 
 
 class Topics:
-    """A node of rclpy that keeps what is published."""
+    """Stand in for a node of rclpy and store the published messages."""
 
     def __init__(self) -> None:
         self.sent: dict[str, list[Any]] = {}
@@ -114,7 +115,7 @@ class Topics:
 
 
 def _message_class(kind: Any) -> type:
-    """A class as rosidl generates it: fields by name only, and octets as bytes."""
+    """Return a class as rosidl generates it: fields by name only, and octets as bytes."""
     names = [one.name for one in fields(kind)]
     octets = {"level"} if kind.__name__ == "DiagnosticStatus" else set()
 

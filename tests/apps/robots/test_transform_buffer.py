@@ -1,4 +1,4 @@
-"""TF: look-ups along the tree at a time, waiting, and trees that are broken."""
+"""Test TF: look-ups along the tree at a time, waiting, and broken trees."""
 
 from __future__ import annotations
 

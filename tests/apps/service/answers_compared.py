@@ -1,4 +1,4 @@
-"""Answers as far as they must be the same."""
+"""Reduce results to the parts that must be equal."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ import re
 
 
 def without_times(line: str) -> str:
-    """The JSON line of a result to the byte, but for its times."""
+    """Return the JSON line of a result without its times."""
     return re.sub(r'"times_ms": \{[^}]*\}', "", line)

@@ -1,4 +1,4 @@
-"""Maps, and a service of them that all tests ask."""
+"""Provide maps, and a service of them that all tests query."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @pytest.fixture(scope="session")
 def maps(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of maps: `room`; `earth`, which knows its place on earth; `damaged`, whose nodes
-    cannot be read."""
+    """Return a folder of maps: `room`, `earth` with a place on earth, and `damaged` with
+    unreadable nodes."""
     folder = tmp_path_factory.mktemp("maps")
     shutil.copy(room_map, folder / "room.topo")
     shutil.copy(room_map, folder / "damaged.topo")
@@ -42,7 +42,7 @@ def maps(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A service of these maps with tight limits, for all tests."""
+    """Run one service of these maps with tight limits for all tests."""
     config = tmp_path_factory.mktemp("config") / "limits.toml"
     config.write_text(LIMITS)
     with running(maps, "--workers", 2, "--config", config) as service:
@@ -57,7 +57,8 @@ def client(service: Running) -> Iterator[httpx.Client]:
 
 @pytest.fixture(scope="session")
 def open_service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A service of the map `earth` with a token, for pages of two other origins too."""
+    """Run a service of the map `earth` with a token, which also accepts pages of two
+    other origins."""
     token = tmp_path_factory.mktemp("token") / "token"
     token.write_text(SIGNED_TOKEN)
     origins = ("--allow-origin", PAGE, "--allow-origin", "http://localhost:3000")
@@ -67,31 +68,31 @@ def open_service(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 @pytest.fixture(scope="session")
 def asked(open_service: Running) -> Iterator[httpx.Client]:
-    """Asks it with the token."""
+    """Return a client of that service which sends the token."""
     with open_service.client(headers={"authorization": f"Bearer {SIGNED_TOKEN}"}) as client:
         yield client
 
 
 @pytest.fixture(scope="session")
 def view(queries: Path) -> Path:
-    """A picture of the room."""
+    """Return the path of an image of the room."""
     return queries / "view02.png"
 
 
 @pytest.fixture(scope="session")
 def camera(queries: Path) -> str:
-    """Its calibration, as the form's field takes it."""
+    """Return the calibration of the image as the form's field takes it."""
     return (queries / "camera.json").read_text()
 
 
 class _Files(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @pytest.fixture(scope="session")
 def site() -> Iterator[str]:
-    """The repository as `python -m http.server` shows it."""
+    """Serve the repository as `python -m http.server` does."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Files, directory=ROOT)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"

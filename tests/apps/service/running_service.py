@@ -1,5 +1,4 @@
-"""A service as its users meet it: `topoloc serve` in a process of its own on 127.0.0.1, asked over
-HTTP."""
+"""Run `topoloc serve` in its own process on 127.0.0.1 and query it over HTTP, as users do."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ LIMITS = (
 
 @dataclass
 class Running:
-    """A service that runs; `log` grows as it writes."""
+    """Hold a running service. `log` grows as the service writes."""
 
     url: str
     process: subprocess.Popen[str]
@@ -39,14 +38,14 @@ class Running:
         return httpx.Client(base_url=self.url, timeout=60.0, **options)  # pyright: ignore[reportArgumentType]
 
     def end(self) -> int:
-        """The status that it ends with when it is told to."""
+        """Stop the service with a signal and return its exit status."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(30)
 
 
 @contextmanager
 def running(*args: object) -> Iterator[Running]:
-    """`topoloc serve` with these arguments on a free port."""
+    """Run `topoloc serve` with these arguments on a free port."""
     command = [sys.executable, "-m", "topoloc", "serve", *map(str, args), "--port", "0"]
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)

@@ -1,4 +1,4 @@
-"""Whatever comes, the one who sends it gets one sentence, and everybody else their answers."""
+"""Check that any bad request gets one sentence, and that other clients still get results."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ LOCALIZE = "/v1/maps/room/localize"
 
 
 def _png_of(width: int, height: int) -> bytes:
-    """A small file that claims to be a picture of this size, of zeros: a decompression bomb where
-    it is large."""
+    """Return a small PNG file of zeros that declares this size. A large size makes it a
+    decompression bomb."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (
@@ -91,8 +91,8 @@ def test_pictures_that_are_none(client: httpx.Client, view: Path, kind: str):
 
 
 def test_who_sends_too_much_slowly_reads_why_all_the_same(service: Running):
-    """A connection that is closed while its client sends is reset, and with it what the client has
-    not read yet."""
+    """If the server closes a connection while the client sends, TCP resets it, and
+    unread data is lost."""
     address, part = urlsplit(service.url), bytes(32_000)
     with socket.create_connection((address.hostname, address.port or 80), 20.0) as sending:
         head = (
@@ -241,8 +241,8 @@ def test_a_client_that_goes_away_harms_nobody(service: Running, client: httpx.Cl
 
 
 def test_too_many_at_a_time_are_told_when_to_come_again(service: Running, view: Path, camera: str):
-    """34 may be answered or wait; of 60 at once some are told to come again, and all others get
-    their pose."""
+    """Up to 34 requests run or wait. Of 60 at once, some get a time to retry, and all
+    others a pose."""
     data = view.read_bytes()
     answers = list[httpx.Response]()
 

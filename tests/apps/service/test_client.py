@@ -1,4 +1,4 @@
-"""The client in Python: what it gets is what a localizer gives."""
+"""Check that the Python client returns the results of a localizer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One address cannot take all connections, and what a client does not read is not kept."""
+"""Check that one address cannot take all connections, and that unread answers are not stored."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _open(service: Running, *requests: str, source: str = "127.0.0.1") -> socket
 
 
 def _receive(opened: socket.socket) -> int:
-    """Return the number of bytes; 0 at the end."""
+    """Return the number of received bytes, or 0 at the end."""
     with suppress(ConnectionResetError):
         return len(opened.recv(1_000_000))
     return 0
@@ -261,7 +261,7 @@ def test_all_workers_share_one_budget_of_pixels(monkeypatch: pytest.MonkeyPatch)
 def test_images_of_50_megapixels_take_the_memory_that_the_docs_name(
     maps: Path,
 ):
-    """Two at once to two workers took 2.4 GB."""
+    """Two such images at once took 2.4 GB in two workers."""
     file = io.BytesIO()
     Image.new("RGB", (7070, 7070)).save(file, "WEBP")
     long = io.BytesIO()

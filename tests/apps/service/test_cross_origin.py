@@ -1,5 +1,5 @@
-"""Pages of other sites ask the service if their origin is allowed, as browsers do it: a preflight,
-then the request, whose answer they hide unless a header allows it."""
+"""Test requests of pages from other origins. As browsers do, send a preflight first. Browsers hide
+an answer without the header that allows the origin."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The files of deploy/ say what the program and its image are: options, port, user, paths. Schemas:
-docs/service.md."""
+"""Check that the files of deploy/ match the program and its image: options, port, user, paths.
+docs/service.md names the schemas."""
 
 from __future__ import annotations
 

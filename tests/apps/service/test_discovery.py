@@ -1,5 +1,4 @@
-"""Discovery by SpatialDDS 1.6: who searches where the map is finds the service, and nobody else
-does."""
+"""Test discovery by SpatialDDS 1.6: only searches in the area of a map find the service."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The GeoPose Protocol: requests as its reference clients write them, replies held against its
-schema and the native answer."""
+"""Test the GeoPose Protocol: requests of its reference clients, and replies against its schema and
+the native result."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def _params(camera: str) -> dict[str, Any]:
 
 
 def _version_2(view: Path, camera: str, **changed: Any) -> dict[str, Any]:
-    """As python/demo_client.py of the protocol's repository writes it, which calls a file's bytes
-    RGBA32."""
+    """Return a request as the protocol's python/demo_client.py writes it. It declares file
+    bytes as RGBA32."""
     reading = {
         "timestamp": 1.7e12,
         "sensorId": "my_camera_sensor",
@@ -88,8 +88,8 @@ def _version_2(view: Path, camera: str, **changed: Any) -> dict[str, Any]:
 
 
 def _version_1(view: Path, camera: str) -> dict[str, Any]:
-    """As demo_ac/oscp_demo_client.py writes it, with the camera's parameters where version 1 has
-    them."""
+    """Return a request as demo_ac/oscp_demo_client.py writes it, with the camera
+    parameters of version 1."""
     picture = {
         "sequenceNumber": 0,
         "imageFormat": "JPG",

@@ -1,4 +1,4 @@
-"""The client in JavaScript: its tests under Node against a service, its types and its package."""
+"""Test the JavaScript client: its tests under Node against a service, its types and its package."""
 
 from __future__ import annotations
 

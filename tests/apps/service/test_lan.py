@@ -1,4 +1,4 @@
-"""`topoloc serve --lan`: the link, its code, its token and its certificate."""
+"""Test `topoloc serve --lan`: the link, its code, its token and its certificate."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytest.importorskip("cryptography", reason="the extra lan is not installed")
 
 
 def _link(service: Running) -> tuple[str, str]:
-    """The address of the first link, and its token."""
+    """Return the address of the first link, and its token."""
     for _ in range(100):
         for line in service.log:
             if found := re.match(r"(https://\S+)/#token=(\S+)", line):

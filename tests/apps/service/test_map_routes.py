@@ -1,5 +1,5 @@
-"""The native routes, from outside: answers are those of the command line, and a map replaced on
-disk is the next one asked."""
+"""Test the native routes over HTTP: results equal the command line's, and a replaced
+map file is used."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Notes at places of a map: who may add how many, where they are kept, and that they move with the
-map."""
+"""Test notes at places of a map: the limit of their number, their file, and moves with the map."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ def folder(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def noted(folder: Path) -> Iterator[httpx.Client]:
-    """A service that keeps three notes of a map."""
+    """Return a client of a service that keeps three notes per map."""
     config = folder / "limits.toml"
     config.write_text("[serve]\nmax_notes = 3\n")
     with running(folder, "--config", config) as service, service.client() as client:

@@ -1,5 +1,5 @@
-"""What OpenAPI says of the service holds: its examples are accepted, its schemas are those of the
-answers."""
+"""Check the OpenAPI document: the service accepts its examples, and its schemas
+match the answers."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _operations(document: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]
 
 
 def _nodes(value: Any) -> Iterator[dict[str, Any]]:
-    """Every object in a document."""
+    """Yield each object in a document."""
     if isinstance(value, dict):
         yield value
     for one in value.values() if isinstance(value, dict) else value:

@@ -1,5 +1,5 @@
-"""The page at `/`, in a real browser, of a service in a process of its own: a picture of the demo's
-world is dropped, pasted, chosen, and its answer is listed, saved and linked."""
+"""Test the page at `/` in a real browser. An image of the demo's world is dropped, pasted or
+chosen. Its result is listed, saved and linked."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ BROUGHT = """([how, name, base64]) => {
 
 @dataclass(frozen=True)
 class Lab:
-    """A service of a map of the demo's first frames and of its copy `room`, and a picture taken
-    there on another lap."""
+    """Hold a service of a map of the demo's first frames and its copy `room`, and an image
+    of another lap."""
 
     service: Running
     map: Path
@@ -74,8 +74,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 
 
 def _bring(page: Any, lab: Lab, how: str) -> None:
-    """The picture comes to the page in this way, with its calibration; returns when there is an
-    answer."""
+    """Add the image with its calibration to the page in this way, and wait for the result."""
     page.wait_for_selector("#scene canvas")
     page.locator("#camera-field summary").click()
     page.get_by_label("fx, fy, cx, cy in pixels").last.fill(lab.camera)
@@ -89,7 +88,7 @@ def _bring(page: Any, lab: Lab, how: str) -> None:
 
 
 def _frustum(page: Any) -> np.ndarray:
-    """The centre of the camera that is drawn, metres."""
+    """Return the centre of the drawn camera in metres."""
     centres = page.evaluate(
         """() => { const all = []; document.getElementById("scene").viewer.chosen.traverse((one) => {
         if (one.userData.kind === "answer") all.push([...one.geometry.attributes.position.array.slice(0, 3)]); }); return all; }"""  # noqa: E501
@@ -257,7 +256,7 @@ def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):
 
 
 def test_a_live_stream_draws_the_way(lab: Lab, browser: Any):
-    """The browser's camera is a canvas with the picture; the rest is as with a real one."""
+    """A canvas with the image replaces the browser's camera."""
     with opened(browser, f"{lab.service.url}/", 1300) as page:
         page.wait_for_selector("#scene canvas")
         page.evaluate(
@@ -328,7 +327,7 @@ def test_the_scene_is_that_of_the_file_that_is_there_now(room_map: Path, lab: La
 
 
 def test_a_map_that_grows_is_drawn_again_seen_as_before(browser: Any, lab: Lab):
-    """As `topoloc map` writes it: a file with more nodes in place of the one that is shown."""
+    """`topoloc map` replaces the displayed file by one with more nodes."""
     growing = lab.map.with_name("growing.topo")
     view = """() => { const { camera, controls } = document.getElementById("scene").viewer.stage;
         return [...camera.position.toArray(), ...controls.target.toArray()]; }"""

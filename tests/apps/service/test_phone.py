@@ -1,5 +1,5 @@
-"""The page as a phone uses it, in a real browser whose camera shows the demo's recording: the map
-lies over the image where truth puts it, notes are shared, and what a device lacks is said."""
+"""Test the page as a phone uses it, in a real browser whose camera shows the demo's recording. The
+map overlay lies at the true pixels, notes are shared, and missing device features are reported."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ AWAKE = """Object.defineProperty(navigator, "wakeLock", { value: { request: asyn
 
 @dataclass(frozen=True)
 class Phone:
-    """A browser whose camera shows the frames of `walk`, and a service of a map of the place."""
+    """Hold a browser whose camera shows the frames of `walk`, and a service of a map
+    of that place."""
 
     browser: Any
     service: Running
@@ -84,7 +85,8 @@ def phone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
 
 @contextmanager
 def live(phone: Phone, script: str = "", size: tuple[int, int] = (400, 800)) -> Iterator[Any]:
-    """The page with the live camera on, after this script ran; any error of it fails the test."""
+    """Open the page with the live camera on, after running this script. Any page error
+    fails the test."""
     width, height = size
     page = phone.browser.new_page(viewport={"width": width, "height": height})
     errors = list[str]()
@@ -100,7 +102,7 @@ def live(phone: Phone, script: str = "", size: tuple[int, int] = (400, 800)) -> 
 
 
 def _wait(page: Any, condition: str, seconds: float = 60.0) -> None:
-    """Wait until this is true; `wait_for_function` is barred by the page's policy."""
+    """Wait until a condition is true. The page's policy forbids `wait_for_function`."""
     for _ in range(int(10 * seconds)):
         if page.evaluate(condition):
             return
@@ -109,7 +111,7 @@ def _wait(page: Any, condition: str, seconds: float = 60.0) -> None:
 
 
 def _errors(phone: Phone, shown: dict[str, Any]) -> np.ndarray:
-    """How far the drawn points are from where truth puts them, pixels of the image."""
+    """Return the pixel distance of each drawn point from its true projection."""
     data = base64.b64decode(shown["image"].partition(",")[2])
     image = read_image(EncodedImage("drawn", data))[:, :, :3].astype(float)
     i = min(FRAMES, key=lambda i: float(np.abs(phone.walk[i].image - image).mean()))
@@ -219,7 +221,8 @@ def test_the_motion_sensor_turns_the_map_between_answers(phone: Phone):
 
 
 def test_the_motion_sensor_is_read_in_every_position_of_the_screen(phone: Phone):
-    """Upright towards the north: portrait, and turned by 90 degrees to the left and right."""
+    """The phone stands upright and faces north: portrait, and rotated by 90
+    degrees to each side."""
     page = phone.browser.new_page()
     page.goto(phone.service.url)
     seen = page.evaluate(
@@ -326,7 +329,7 @@ def test_points_are_projected_as_the_camera_does(phone: Phone, camera: Camera):
 
 
 def test_a_note_lies_on_the_surface_in_front(phone: Phone):
-    """Of two walls and a stray point before them, the nearer wall is meant."""
+    """The note lies on the nearer of two walls, not on a stray point in front of them."""
     side = np.arange(-2.0, 2.01, 0.05)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     walls = [np.stack([x, y, np.full(x.size, z)], axis=1) for z in (3.0, 6.0)]

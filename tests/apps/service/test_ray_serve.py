@@ -1,4 +1,4 @@
-"""The service as replicas of Ray Serve, on a cluster of this machine alone."""
+"""Test the service as replicas of Ray Serve, on a cluster of this machine."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_replicas_come_and_go_between_the_least_and_the_most():
 
 @contextmanager
 def _on_ray(*args: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`topoloc serve --ray local` with these arguments, and its address."""
+    """Run `topoloc serve --ray local` with these arguments, and yield its process and address."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     command = [

@@ -1,4 +1,4 @@
-"""Who is let in, and how the service ends."""
+"""Test access to the service and its shutdown."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def test_only_those_with_the_token_are_answered(maps: Path, view: Path, tmp_path
 def test_requests_in_progress_are_finished_when_it_is_told_to_end(
     maps: Path, queries: Path, camera: str
 ):
-    """Sixteen wait when the signal comes; each gets its answer, and the process ends with status
-    0."""
+    """Sixteen requests wait when the signal arrives. Each gets its answer, and the
+    process exits with 0."""
     asked = {"files": {"image": (queries / "view02.png").read_bytes()}, "data": {"camera": camera}}
     statuses, together, until = list[int](), threading.Barrier(16), time.monotonic() + 60.0
     with (

@@ -1,4 +1,4 @@
-"""Streams from outside: a request a picture, or a WebSocket."""
+"""Test streams over the network: one request per image, or a WebSocket."""
 
 from __future__ import annotations
 

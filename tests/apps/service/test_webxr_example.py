@@ -1,5 +1,5 @@
-"""The example for WebXR in a real browser, as a page of another origin than the service's. The
-session is made by hand, because augmented reality needs a phone."""
+"""Test the WebXR example in a real browser, as a page of another origin. Augmented reality needs a
+phone, so the test makes the session itself."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def service_url(maps: Path, site: str) -> Iterator[str]:
 
 @contextmanager
 def _example(browser: Any, site: str, script: str = "") -> Iterator[Any]:
-    """The page of the example. Whatever it says on its console as an error fails the test."""
+    """Open the page of the example. Any error on its console fails the test."""
     page, errors = browser.new_page(), list[str]()
     page.on("console", lambda one: errors.append(one.text) if one.type == "error" else None)
     page.on("pageerror", lambda error: errors.append(str(error)))
@@ -111,7 +111,7 @@ def test_a_picture_is_localized_from_another_origin(
 
 
 def _in_module(browser: Any, site: str, call: str, *args: object) -> np.ndarray:
-    """What a function of the example's geometry.js returns."""
+    """Return the result of a function in the example's geometry.js."""
     with _example(browser, site) as page:
         program = (
             "([call, args]) => import('/examples/webxr/geometry.js').then((g) => g[call](...args))"
@@ -150,7 +150,7 @@ def test_metres_between_places(browser: Any, site: str):
 
 
 def _projection(fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> list[float]:
-    """A projection of OpenGL with this calibration, columns first."""
+    """Return an OpenGL projection matrix with this calibration, column by column."""
     rows = [
         [2 * fx / width, 0, 1 - 2 * cx / width, 0],
         [0, 2 * fy / height, 2 * cy / height - 1, 0],

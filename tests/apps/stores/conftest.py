@@ -1,3 +1,3 @@
-"""The fixtures of a second map and of buckets."""
+"""Import the fixtures of a second map and of buckets."""
 
 from atlas_fixtures import *  # noqa: F403

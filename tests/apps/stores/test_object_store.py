@@ -1,4 +1,4 @@
-"""Stores that answer late, wrongly or not at all, and what is asked of S3 in particular."""
+"""Test stores that answer late, wrongly or never, and the requests to S3."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from topoloc.localization.result import Localization
 
 @pytest.fixture
 def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A store that takes connections and says nothing."""
+    """Return the address of a store that accepts connections and never answers."""
     pytest.importorskip("obstore", reason="the extra cluster is not installed")
     listener = socket.create_server(("127.0.0.1", 0), backlog=64)
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{listener.getsockname()[1]}")
@@ -142,7 +142,7 @@ def test_a_conflict_with_another_writer_is_tried_anew_and_other_failures_are_tol
 def test_an_answer_that_was_lost_is_no_other_writer(
     s3_bucket: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """The client sends again what has arrived: the object is there, and it is ours."""
+    """The client repeats a write that succeeded. The object exists and is its own."""
     store = ObjectStore(f"{s3_bucket}/campus")
     put = type(store._objects).put
 

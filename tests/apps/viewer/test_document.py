@@ -1,4 +1,4 @@
-"""The document of a scene: right about the map, finite, within its budget."""
+"""Test the document of a scene: it matches the map, is finite and keeps its budget."""
 
 from __future__ import annotations
 

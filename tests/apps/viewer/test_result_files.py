@@ -1,5 +1,4 @@
-"""Files of results: each kind is known by what it holds, and what is none is named with its
-line."""
+"""Test result files: the content decides the kind, and an invalid line is named."""
 
 from __future__ import annotations
 

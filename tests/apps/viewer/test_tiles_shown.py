@@ -1,5 +1,5 @@
-"""Tiles of an atlas that share a world, shown and exported together: each where the atlas knows it
-to lie."""
+"""Test the display and export of an atlas's tiles that share a world, each at its
+place in the atlas."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from topoloc.apps.viewer.document import ResultSet, create_document
 from topoloc.apps.viewer.worlds import create_world_document, create_world_scene, transform_answers
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, create_atlas
-from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.place import SharedWorld
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.localizer import Localizer

@@ -1,4 +1,4 @@
-"""Tracks: one point where several nodes have one, and no key point that its point does not fit."""
+"""Test tracks: one point for all nodes that see it, and only key points that fit it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`topoloc view`: the page works from a file, in a real browser, wide and narrow, light and dark,
-by mouse and by keyboard."""
+"""Test `topoloc view`: the page works from a file, in a real browser, wide and narrow, light and
+dark, by mouse and by keyboard."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ COVARIANCE = np.diag([0.04, 0.01, 0.0025, 0.02, 0.01, 0.04])
 
 @dataclass(frozen=True)
 class Shown:
-    """A page of the room, and the poses of what it shows: one answer that is off by 5 cm, one that
-    is ambiguous."""
+    """Hold a page of the room and the poses of its results. One result is off by 5 cm,
+    another is ambiguous."""
 
     page: Path
     found: Rigid3
@@ -76,8 +76,8 @@ def shown(room_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Shown:
 
 
 def _centres(page: Any, kind: str) -> np.ndarray:
-    """Where the frustums of this kind really are: the vertex that all their lines from the centre
-    share."""
+    """Return the centres of the frustums of this kind: the vertex that all lines from
+    a centre share."""
     found = page.evaluate(
         f"""() => {{ const all = []; {VIEWER}.chosen.traverse((one) => {{
         if (one.userData.kind === "{kind}") all.push([...one.geometry.attributes.position.array.slice(0, 3)]); }}); return all; }}"""  # noqa: E501
@@ -206,7 +206,7 @@ def test_two_clicks_measure_a_distance(browser: Any, shown: Shown):
 
 
 def test_a_point_in_front_is_measured(browser: Any, shown: Shown):
-    """Of the points about a click the one that is seen, not one of a wall behind it."""
+    """A click measures the visible point, not a point of the wall behind it."""
     with opened(browser, shown.page.as_uri(), 1300) as page:
         page.get_by_role("button", name="Measure").click()
         points, seen, depths, nodes = page.evaluate(f"""() => {{

@@ -1,5 +1,5 @@
-"""rho, the share of error that map points have in common, on maps whose nodes are in their places
-and on one whose nodes are not."""
+"""Test rho, the correlated error share of map points, on maps with right node poses and one
+with wrong ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WEIGHTS = load_fitted_weights("surf").shared_errors
 
 
 def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMetricMap:
-    """The same map, its nodes moved at random."""
+    """Return the map with a random error in each node pose."""
     rng = np.random.default_rng(0)
     nodes = []
     for node in topomap.nodes:
@@ -59,7 +59,7 @@ def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(
 
 @pytest.fixture
 def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
-    """The maps that were measured since."""
+    """Return the list of maps that are measured from now on."""
     measured: list[TopoMetricMap] = []
     measure = ErrorShareMeasurement.measure
 

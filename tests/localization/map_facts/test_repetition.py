@@ -1,4 +1,4 @@
-"""Places that repeat themselves: by which moves the map finds them, and what is answered there."""
+"""Test repetitions: the transforms that the map finds, and the results at repeated places."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def room(tiny_recording: Path) -> TopoMetricMap:
 
 
 def _wall(num_panels: int, noise: float = 0.0) -> LocalMap:
-    """A wall of equal panels; each sees every point of the panel a little differently."""
+    """Return a wall of equal panels. Each panel has its own noise in the descriptors."""
     rng = np.random.default_rng(5)
     looks = rng.normal(size=(len(PANEL), 64))
     descriptors = np.concatenate(
@@ -77,8 +77,8 @@ def test_what_is_there_once_does_not_repeat_itself():
 
 
 def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_panels():
-    """A handle above a handle: a third of the points find a copy there, where all find one a panel
-    on."""
+    """With one handle above another, a third of the points have a copy there. All points have one
+    in the next panel."""
     wall = _wall(4)
     few = np.tile(np.arange(len(PANEL)) < 13, 4)
     above = LocalMap(
@@ -106,8 +106,8 @@ def test_copies_are_the_points_and_what_each_shift_makes_of_them():
 
 
 def _turned(opened: OpenMap, row: int) -> list[Rigid3]:
-    """The moves that are no shifts: all surfaces of this room are blobs, which resemble each
-    other."""
+    """Return the transforms with a rotation. All surfaces of this room are blobs,
+    which look similar."""
     return [move for move in map(Rigid3.from_matrix, opened.moves(row)) if move.angle() > 0.1]
 
 
@@ -153,7 +153,7 @@ def test_what_was_found_of_other_nodes_is_found_anew(room: TopoMetricMap):
 
 
 class _OnlyTheFirstRoom:
-    """Retrieval that never names the second one."""
+    """Rank only nodes of the first room."""
 
     def __init__(self, num_nodes: int) -> None:
         self._num_nodes = num_nodes
@@ -168,7 +168,7 @@ class _OnlyTheFirstRoom:
 def test_a_copy_that_retrieval_does_not_name_is_found_by_the_map(
     room: TopoMetricMap, max_repetitions: int, monkeypatch: pytest.MonkeyPatch
 ):
-    """Without repetitions one of the two is believed, and half of the time wrongly."""
+    """Without repetitions, one of the two places is reported, and half of these poses are wrong."""
     monkeypatch.setattr(LocalizerConfig, "max_repetitions", max_repetitions)
     localizer = Localizer(
         twice(room),

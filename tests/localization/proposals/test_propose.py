@@ -1,5 +1,5 @@
-"""Where first poses come from, and when they are not sought: look-alikes, what nodes saw, a
-prior."""
+"""Test the sources of pose proposals and when they are skipped: similar places, node
+viewpoints, a prior."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import localizer as localizer_module, schedule
+from topoloc.localization import map_query
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
 from topoloc.localization.fitted_weights import load_fitted_weights
@@ -75,7 +75,7 @@ def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     """What other proposals are for."""
-    monkeypatch.setattr(schedule, "propose_more", lambda _: iter(()))
+    monkeypatch.setattr(map_query, "propose_more", lambda _: iter(()))
     localizer = Localizer(twice(room))
     results = [localizer.localize(picture, CAMERA) for picture, _ in unseen_views()]
     assert not any(
@@ -142,7 +142,7 @@ def test_dark_images_are_localized_that_are_not_without_viewpoints(room: TopoMet
 
 
 def _never_clear(room: TopoMetricMap, config: LocalizerConfig | None = None) -> Localizer:
-    """Every image is treated as one that is not clear."""
+    """Return a localizer for which no image has a clear pose."""
     weights = load_fitted_weights("surf")
     return Localizer(
         room,
@@ -169,7 +169,7 @@ def test_images_that_are_never_clear_are_answered_all_the_same_and_those_of_else
 def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_inliers_first(
     room: TopoMetricMap,
 ):
-    """All nodes around show the same place: one pose comes of them."""
+    """All nodes around show the same place, so that one pose follows."""
     trace = Trace()
     _never_clear(room).localize(unseen_views()[2][0], CAMERA, trace=trace)
     fits = [tried.first for tried in trace.tried if tried.source == "viewpoints"]
@@ -193,7 +193,7 @@ def test_only_so_many_viewpoints_are_followed_up(room: TopoMetricMap):
 
 @pytest.fixture
 def fits(monkeypatch: pytest.MonkeyPatch) -> list[PointMatches]:
-    """The fits to enough matches, found by RANSAC since."""
+    """Return the list of fits with enough matches that RANSAC finds from now on."""
     found, fit_pose = list[PointMatches](), propose.fit_pose
 
     def told(*arguments: Any, min_matches: float = 4.0, **settings: Any) -> PointMatches:
@@ -208,7 +208,8 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[PointMatches]:
 def test_an_image_from_elsewhere_is_refused_after_the_first_pose(
     room: TopoMetricMap, fits: list[PointMatches]
 ):
-    """Neither look-alikes nor RANSAC on what viewpoints show: refusing is as quick as answering."""
+    """No similar place is tried and no viewpoint uses RANSAC, so that a refusal is as
+    fast as a pose."""
     localizer = Localizer(room)
     noise = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
     for picture in (noise, *(picture for picture, _ in unseen_views(seed=1, step=4.0))):
@@ -271,7 +272,7 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(
         followed.append(proposal)
         return verify(proposal)
 
-    monkeypatch.setattr(localizer_module, "verify", follow)
+    monkeypatch.setattr(map_query, "verify", follow)
     for picture, _ in unseen_views():
         followed.clear()
         assert isinstance(Localizer(room).localize(picture, CAMERA), Localization)
@@ -295,7 +296,7 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(
 def test_a_clear_pose_is_refined_with_its_own_nodes_if_the_nearest_ones_see_something_else(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
-    """As around a bend. The farthest node stands for the nearest ones."""
+    """This happens around a bend. The farthest node stands for the nearest ones."""
     localizer, (picture, truth) = Localizer(room), unseen_views()[0]
     (search, *_) = localizer.context.searches(QueryImage(picture, CAMERA), StageClock(), Deadline())
     first = propose.propose_first(search, None)

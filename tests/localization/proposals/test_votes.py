@@ -1,4 +1,4 @@
-"""Places by votes of single features, when the coarse localizer ranks others first."""
+"""Test places voted by single features, if the coarse localizer ranks other places first."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from doubled_room import twice
 from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
-from topoloc.localization import schedule
+from topoloc.localization import map_query
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.proposals import votes
@@ -25,13 +25,13 @@ from topoloc.retrieval.coarse import Image, NodeScore
 
 @pytest.fixture(scope="module")
 def room(tiny_recording: Path) -> TopoMetricMap:
-    """Two rooms that are hardly alike."""
+    """Return a map of two rooms with few common points."""
     return twice(built_room(tiny_recording), share_alike=0.02)
 
 
 @pytest.fixture
 def any_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Votes are asked even if the retrieved nodes agree by chance."""
+    """Use votes even if the retrieved nodes agree by chance."""
     monkeypatch.setattr(LocalizerConfig, "num_chance_inliers", 0)
 
 
@@ -58,7 +58,7 @@ def test_votes_find_the_place_when_other_nodes_rank_first(
         assert isinstance(found, Localization)
         assert translation_error(found.world_from_cam, truth) < 0.05
     assert "votes" in {one.source for one in trace.tried}
-    monkeypatch.setattr(schedule, "propose_voted_places", lambda _: iter(()))
+    monkeypatch.setattr(map_query, "propose_voted_places", lambda _: iter(()))
     lost = [localizer.localize(picture, CAMERA) for picture, _ in views]
     assert sum(isinstance(one, NotLocalized) for one in lost) >= len(views) // 2
 

@@ -1,4 +1,4 @@
-"""A place is recognised by strong matches first, and by all of them then."""
+"""Check that a place is recognised by strong matches first, and then by all matches."""
 
 from __future__ import annotations
 

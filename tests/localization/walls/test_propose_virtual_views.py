@@ -1,5 +1,5 @@
-"""Who comes back along a corridor that was mapped in one direction is localized by its walls, and
-nobody else is."""
+"""Check that virtual views localize images in reverse direction along a corridor, and
+no other images."""
 
 from __future__ import annotations
 
@@ -134,7 +134,8 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
 
 
 def test_the_points_seen_are_handed_on(localizer: Localizer):
-    """Streams follow them: each is a point of the walls, at the pixel of the picture."""
+    """Streams track the matched points. Each is a point of the virtual views, at its
+    pixel in the image."""
     picture, truth = seen_on_the_way_back()[2]
     result, named = localizer.localize_query(QueryImage(picture, WIDE))
     assert isinstance(result, Localization)
@@ -223,7 +224,7 @@ def test_a_camera_that_is_not_known_or_sees_no_walls_gets_no_answer_by_them(loca
 
 
 def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
-    """A map whose walls stand a second time so many metres farther along."""
+    """Return a map with a second copy of its virtual views, `apart` metres farther along."""
     sides = topomap.sides
     assert sides is not None
     moved = Rigid3(np.eye(3), np.array([0.0, apart, 0.0]))
@@ -265,7 +266,7 @@ def test_walls_that_stand_in_two_places_are_no_answer():
 def _by_the_walls(
     topomap: TopoMetricMap, picture: np.ndarray, config: VirtualViewSearchConfig | None = None
 ) -> list[Hypothesis]:
-    """What the walls let expect, whatever the nodes say; the likeliest first."""
+    """Return the hypotheses of virtual views alone, the likeliest first."""
     search = _search(topomap, picture, config)
     for proposal in propose_virtual_views(search):
         search.add(verify(proposal))
@@ -363,7 +364,7 @@ def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes(
 
 
 def test_walls_that_look_alike_elsewhere_have_less_for_them():
-    """The points there are the same, and so tell nothing; and each place is named once."""
+    """Equal points are no evidence for one of the two places, and each place is proposed once."""
     picture, truth = seen_on_the_way_back()[2]
     once, twice = (
         _by_the_walls(m, picture) for m in (built_corridor(), _twice(built_corridor(), apart=60.0))

@@ -1,4 +1,4 @@
-"""A first pose from what two cameras that are held upright saw of one wall."""
+"""Test the pose proposal from matches of one wall in two upright cameras."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ NUM_POINTS, NODE_DEPTH = 60, 1.4
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A wall before an upright camera, and where another one sees its points; row k of both is a
-    match, right where `is_right`."""
+    """Hold points of a wall and their projections in another upright camera. Row k of both is a
+    match, right if `is_right`."""
 
     points: np.ndarray
     seen: np.ndarray
@@ -26,8 +26,8 @@ class Wall:
 def _wall(
     side_from_node: Rigid3, share_wrong: float = 0.0, seed: int = 0, thickness: float = 0.0
 ) -> Wall:
-    """A wall 1.4 m before the node's side camera, seen from `side_from_node`; things on it stand
-    out by up to `thickness`, and a share of the matches is wrong."""
+    """Return a wall 1.4 m in front of the virtual camera of a node, as seen from `side_from_node`.
+    Objects stand out by up to `thickness`, and a share of the matches is wrong."""
     rng = np.random.default_rng(seed)
     across, up = rng.uniform(-1.25, 1.25, NUM_POINTS), rng.uniform(-1.0, 1.0, NUM_POINTS)
     points_node = np.column_stack(
@@ -50,15 +50,15 @@ def _side_from_node(found: tuple[int, Rigid3] | None) -> Rigid3:
 
 
 def _upright(turn: float, along: float, up: float, nearer: float) -> Rigid3:
-    """Turned about the vertical, then moved; about the middle of the wall, so that it stays in
-    view."""
+    """Return a rotation about the vertical and a shift, about the middle of the wall, which
+    stays in view."""
     rotation, middle = exp_so3(np.array([0.0, turn, 0.0])), np.array([2.75, 0.0, NODE_DEPTH])
     return Rigid3(rotation, middle - rotation @ middle + np.array([along, up, -nearer]))
 
 
 def test_the_pose_is_found_among_wrong_matches():
-    """Of many views nearly all: where half of the matches are wrong, some of them may agree on
-    another pose as well as the right ones."""
+    """Require nearly all views: with half of the matches wrong, some may agree on another
+    pose equally well."""
     rng, near = np.random.default_rng(0), list[bool]()
     while len(near) < 400:
         turn, along, up, nearer, share_wrong = rng.uniform(

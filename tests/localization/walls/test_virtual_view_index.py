@@ -1,4 +1,4 @@
-"""Which places along the way both sides of a picture name."""
+"""Test the places that both virtual views of an image retrieve."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ def test_each_side_node_names_a_place_that_looks_back_at_its_wall(
 def test_a_place_that_both_views_name_comes_before_one_that_is_more_like_one_of_them(
     index: VirtualViewIndex, views: list[VirtualView]
 ):
-    """Along the corridor (y): both views a little like one place, one view more like another."""
+    """Along the corridor (y), both views are similar to one place, and one view is more
+    similar to another."""
     named = _named(index, views)
     ways = [of_view.centres[:, 1] for of_view in named]
     right, twin = float(np.median(ways[0])), float(ways[0].max())

@@ -1,4 +1,4 @@
-"""Both sides of a picture matched at once with the walls around a pose."""
+"""Test joint matching of both virtual views of an image around a pose."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _centres_and_axes() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _seen() -> list[QueryVirtualView]:
-    """Both sides of the picture, left first."""
+    """Return both virtual views of the image, left first."""
     seen = []
     for view in make_virtual_views(WIDE):
         features = view.select_inside(extract_features(view.picture(PICTURE), FeatureConfig()))
@@ -154,8 +154,7 @@ def test_what_must_be_seen_lies_in_the_picture_where_the_points_are():
 
 
 def test_the_pose_of_both_sides_is_refined_round_by_round_from_one_that_is_near():
-    """Matches around a pose that is not yet right draw it towards themselves, so once is not
-    enough."""
+    """Matches around an inexact pose are biased towards it, so that one round is not enough."""
     world_from_cam = Rigid3(TRUTH.rotation, TRUTH.translation + np.array([0.03, -0.06, 0.02]))
     config = AbsolutePoseConfig(max_reprojection_error_px=6.0, sigma_px=2.0)
     for _ in range(3):

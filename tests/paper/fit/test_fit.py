@@ -1,5 +1,5 @@
-"""Weights are found again from poses drawn with known ones; what is right, wrong or lies between;
-the command's file is one that ships."""
+"""Test the fit of weights: known weights are recovered from drawn poses, poses are labelled, and
+the command writes a valid file."""
 
 from __future__ import annotations
 
@@ -99,8 +99,8 @@ def _evidence(rng: np.random.Generator) -> Evidence:
 
 
 def _drawn(num: int, seed: int = 0) -> list[TriedPose]:
-    """Poses that are right with the probability that `TRUE` gives them; the wrong ones are of the
-    place itself."""
+    """Draw poses, each right with the probability that `TRUE` gives it. Wrong ones are of
+    the place itself."""
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
         evidence = _evidence(rng)
@@ -274,7 +274,7 @@ def test_what_cannot_be_fitted_is_told_in_one_line(
 
 
 def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose]:
-    """Poses that walls let expect, right with the probability that these weights give them."""
+    """Draw poses of virtual views, each right with the probability of these weights."""
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
         evidence = replace(

@@ -1,5 +1,4 @@
-"""Other light: a picture stays a picture of eight bits, a seed fixes it, and what is in it can
-still be made out."""
+"""Test random light: the image keeps eight bits, a seed fixes it, and its content stays visible."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ def textured(seed: int = 0) -> np.ndarray:
 
 
 def likeness(first: np.ndarray, second: np.ndarray) -> float:
-    """Correlation of what is left when slow changes of brightness are taken away."""
+    """Return the correlation of two images without slow changes of brightness."""
     flat = [
         np.log(image + 0.02) - cv2.GaussianBlur(np.log(image + 0.02), (0, 0), 8)
         for image in (first, second)

@@ -1,5 +1,5 @@
-"""What training asks for: least where the descriptors are the teacher's, and rivals only where they
-are rivals."""
+"""Test the losses: minimal for the teacher's descriptors, with negatives only from
+different points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def units(seed: int, count: int = 20) -> torch.Tensor:
 
 
 def test_descriptors_are_sampled_where_the_contract_says():
-    """A map whose values are their own place, (x, y, 1) before they are made unit length."""
+    """The map's values are their own position, (x, y, 1), before normalization."""
     stride, width, height = 4, 10, 8
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     maps = torch.stack([x, y, torch.ones_like(x)]).float()[None]

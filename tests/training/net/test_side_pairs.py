@@ -1,5 +1,5 @@
-"""Walls seen from both ends, as `topoloc-net-sides` learns them: pairs of rendered ways, and
-pictures hung on a wall."""
+"""Test the pairs of walls seen from both ends that train `topoloc-net-sides`: rendered routes, and
+images on a wall."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pytest
 from built_corridor import WIDE, WalkAhead, back, corridor
 from tiny_world import render, smooth_texture
 from topoloc.errors import RecordingError
-from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.frame_checks import MemorySequence
+from topoloc.recordings.frame import MemorySequence, StereoFrame
 from topoloc_training.net.side_pairs import find_side_pairs
 from topoloc_training.net.slants import slanted
 

@@ -1,5 +1,5 @@
-"""Training of our own network, as small as can be: it learns, goes on where it was stopped, and
-leaves a network of the contract."""
+"""Train a minimal version of topoloc's own network: it learns, resumes, and exports a
+valid network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch
 
 from tiny_world import path_pose, render, room, write_stereo_recording
 from topoloc.features.network_files import NetworkInfo
-from topoloc.recordings.camera_json import read_camera_json
+from topoloc.recordings.camera_files import read_camera_json
 from topoloc_training.net import teacher as teaching, train as training
 from topoloc_training.net.network import TopolocNet
 from topoloc_training.net.pairs import Pair, find_pairs

@@ -1,5 +1,5 @@
-"""Every network is exported by one contract and answers in ONNX Runtime as it does in PyTorch, at
-any size."""
+"""Check that each network is exported by one contract and gives PyTorch's outputs in ONNX
+Runtime, at any size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from topoloc_training.networks.xfeat import XFeat
 
 
 def of_random_weights(network: nn.Module) -> nn.Module:
-    """Also the batch norms' averages, so that one left out would show."""
+    """Set random weights and batch-norm averages, so that a missing one changes the output."""
     torch.manual_seed(0)
     for norm in (module for module in network.modules() if isinstance(module, nn.BatchNorm2d)):
         norm.running_mean.normal_(0, 0.1)
@@ -79,7 +79,7 @@ def test_the_exported_network_answers_as_the_original(
 
 
 def _descriptors(answers: dict[str, np.ndarray]) -> np.ndarray:
-    """As one output, where they are given as two levels."""
+    """Return the descriptors as one output, also from two levels."""
     if "descriptors" in answers:
         return answers["descriptors"]
     coarse = torch.from_numpy(answers["coarse"]).permute(0, 3, 1, 2)

@@ -33,7 +33,7 @@ def rearranged() -> Scene:
 
 
 def digest(surfaces: list[Surface]) -> list[tuple[str, str]]:
-    """Name and hash of everything that a surface is made of."""
+    """Return name and hash of all data of each surface."""
     result = []
     for surface in surfaces:
         hasher = hashlib.sha256(

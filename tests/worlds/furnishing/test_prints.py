@@ -1,5 +1,5 @@
-"""Prints, screens and materials: sizes and types, readable contrast, each another one, the same
-again from the same seed."""
+"""Test prints, screens and materials: sizes, types, readable contrast, and
+reproducibility by seed."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def test_same_arguments_same_bytes_another_seed_another_ward(day: Scene):
 
 
 def test_a_panel_is_the_copy_of_the_next(day: Scene):
-    """From bay to bay the picture begins anew, and nothing but position changes."""
+    """The texture restarts at each bay, and only the position differs."""
     assert isinstance(named(day, "panels").material.color, np.ndarray)
     mesh = named(day, "panels").mesh
     for quad in mesh.vertices.reshape(-1, 4, 3):
@@ -75,8 +75,8 @@ def test_a_panel_is_the_copy_of_the_next(day: Scene):
 
 @pytest.mark.parametrize("name", ["handrail brackets", "lamp cover"])
 def test_what_is_put_up_has_the_panels_period(day: Scene, name: str):
-    """On the south wing's outer wall, shifted by a bay: every vertex is there again, but at the
-    doors and the wing's ends."""
+    """Each vertex on the south wing's outer wall has a copy one bay further, except at doors
+    and at the ends."""
     points = named(day, name).mesh.vertices
     points = points[points[:, 1] < 1.6]
     beyond = points + np.array([BAY, 0.0, 0.0])

@@ -1,4 +1,5 @@
-"""The lab: the same arguments give the same room; what moves and what stays; room to walk."""
+"""Test the lab: equal arguments give an equal room, only movable objects move, and
+the path is free."""
 
 from __future__ import annotations
 
@@ -94,8 +95,7 @@ def test_another_arrangement_moves_the_movable_only():
 
 
 def _near_the_walk(scene: Scene, clearance: float) -> set[str]:
-    """Names of surfaces with a triangle whose bounding box comes into the corridor around the
-    walked line at the camera's height."""
+    """Return the surfaces with a triangle whose bounding box is near the path, at camera height."""
     corners = np.array([*lab.LOOP, lab.LOOP[0]])
     names = set()
     for surface in scene.surfaces:

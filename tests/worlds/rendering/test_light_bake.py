@@ -1,5 +1,4 @@
-"""Light that is known from formulas, traced; and pictures from it against pictures from paths of
-their own."""
+"""Compare traced light with formulas, and images made from it with path-traced images."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -30,7 +30,8 @@ def grey_sky(value: float = 1.0) -> Sky:
 
 
 def quarters() -> np.ndarray:
-    """A picture with another colour in each corner: red, green above; blue, white below."""
+    """Return an image with another colour in each corner: red and green above, blue
+    and white below."""
     picture = np.zeros((32, 32, 3), np.uint8)
     picture[:16, :16], picture[:16, 16:], picture[16:, :16], picture[16:, 16:] = (
         (255, 0, 0),
@@ -42,7 +43,7 @@ def quarters() -> np.ndarray:
 
 
 def slanted_wall() -> Surface:
-    """A wall through (0, 5, 0) that comes nearer to the right."""
+    """Return a wall through (0, 5, 0) that is nearer to the camera on the right."""
     return Surface(
         "wall", panel((-8, 9, 8), (16, -8, 0), (0, 0, -16)), Material("matt", (0.6, 0.6, 0.6))
     )
@@ -138,8 +139,8 @@ def test_principal_point_and_focal_length_are_exact():
 
 
 def test_light_is_seen_where_colours_are():
-    """The path tracer's camera is the same as that of the rays for colour: a lit wall's border lies
-    where it must."""
+    """The path tracer and the colour rays use one camera: the border of a lit wall is at
+    the right pixel."""
     wall = Surface(
         "wall", panel((-1.0, 4, 0.8), (2.2, 0, 0), (0, 0, -1.5)), Material("matt", (0.5, 0.5, 0.5))
     )

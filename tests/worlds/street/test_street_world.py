@@ -1,5 +1,4 @@
-"""The street: the same town for the same seed, nothing in the way of those who drive, the paper's
-size."""
+"""Test the street: an equal town for an equal seed, a free road, and the size of the paper."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ def moves(surface: Surface) -> bool:
 
 
 def geometry(scene: Scene) -> dict[str, list[bytes]]:
-    """By name, all vertices that stay where they are whatever the arrangement."""
+    """Return by name all vertices that no arrangement moves."""
     found = defaultdict(list)
     for surface in scene.surfaces:
         if not moves(surface):
@@ -43,8 +42,8 @@ def geometry(scene: Scene) -> dict[str, list[bytes]]:
 
 
 def outside_loop(points: np.ndarray) -> np.ndarray:
-    """Signed distance of points (x, y) to the driven line: positive outside a rectangle of 333 by
-    81 m rounded with 12 m."""
+    """Return the signed distance of points (x, y) to the driven line: positive outside of a
+    rectangle of 333 by 81 m with corners of 12 m radius."""
     beyond = np.abs(points) - (np.array([333.0, 81.0]) / 2 - 12.0)
     return (
         np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0) - 12.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from topoloc.mapping.edit import edit_map
-from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.storage.entries import Edit, today
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel

@@ -14,7 +14,7 @@ from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, progr
 from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.cli.tile_option import TileOption, select_tile
 from topoloc.atlas.place import open_place
-from topoloc.mapping.storage.integrity_check import list_coarse_models
+from topoloc.mapping.storage.map_reading import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.network_images import BackboneName

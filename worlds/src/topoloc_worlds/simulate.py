@@ -21,7 +21,7 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.errors import CalibrationError, TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.recordings.camera_json import read_camera_json
+from topoloc.recordings.camera_files import read_camera_json
 from topoloc_worlds.conditions import find_condition
 from topoloc_worlds.demo_recordings import render_recordings
 from topoloc_worlds.recorder import ZED, RecordConfig, Recorded, record

@@ -1,19 +1,20 @@
-"""Fit the weights of a kind of features, and try them on places that they were not fitted to.
+"""Fit the weights of a feature type, and test them on places outside of the fit.
 
     python -m topoloc_paper.fit --kind KIND [--shared ../shared] [--rendered FOLDER] [--step N]
     [--families NAME ...] [--walls]
                                 [--save POSES | --load POSES ...] [--out FILE]
 
-Each place of `corpus.py` is mapped with features of this kind, and asked about its own pictures (in
-good light and bad), about those of other places and about drawn pictures; every pose that was tried
-is kept, not only the one answered. A pose is right within 0.25 m (5 % of the distance, where that
-is less) and 2 degrees, wrong beyond 0.5 m or 10 degrees; what lies between is left out. The walls
-to both sides are asked where a place is walked back that was mapped in one direction; --walls asks
-these places alone and fits the weights of the walls, the others are taken over. --step N asks every
-N-th of the pictures, --families only of the maps of these places; --by-recording tries each
-recording's poses on what was fitted to all others, not each family's; --save keeps the poses, after
-each place, and --load fits to poses that were kept. FILE is what ships as
-`localization/weights/KIND.json`.
+Each place of `corpus.py` is mapped with this feature type. Queries are its own images (bright and
+darkened), images of other places and drawn images. Every tested pose is kept, not only the reported
+one. A pose is right within 0.25 m (5 % of the distance, if that is less) and 2 degrees, and wrong
+beyond 0.5 m or 10 degrees. Poses in between are left out. Virtual views are queried in places that
+were mapped in one direction and are queried in reverse.
+
+`--walls` queries these places alone and fits the weights of virtual views. The other weights stay.
+`--step N` queries every N-th image, `--families` only the maps of these places. `--by-recording`
+tests the poses of each recording with weights fitted to all others, instead of each family.
+`--save` stores the poses after each place, and `--load` fits to stored poses. FILE has the format
+of `localization/weights/KIND.json`.
 """
 
 from __future__ import annotations
@@ -177,8 +178,10 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
 
 
 def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
-    """The weights in use with those of the walls fitted anew, for the kind by which the walls are
-    described."""
+    """Return the current weights with newly fitted weights of virtual views.
+
+    The feature type is the one that describes the virtual views of `kind`.
+    """
     before = load_fitted_weights(find_feature_type(kind).virtual_view_type)
     walls, num = fit_walls(poses, before.walls)
     told = told_by_walls(poses)
@@ -203,7 +206,7 @@ def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
 def corpus_of(
     poses: list[TriedPose], strength: float, num_hard: int, num_walls: int, by_recording: bool
 ) -> str:
-    """One sentence on what was fitted to."""
+    """Return one sentence about the poses used for the fit."""
     num_right, told = sum(pose.is_right for pose in poses), decided(poses)
     places = ", ".join(dict.fromkeys(pose.mapping for pose in poses))
     elsewhere = sum(pose.error_m is None for pose in poses)

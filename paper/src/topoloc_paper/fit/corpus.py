@@ -1,8 +1,8 @@
-"""The places that weights are fitted to: what is mapped, and what it is asked about.
+"""List the places to which weights are fitted: mapping recordings and queries.
 
-The demo's lab ships; the other rendered recordings are made by `topoloc simulate`
-(paper/README.md has the commands); kitchen, ZED lab and KITTI are those of `../shared/data`.
-What is missing is left out, with a line.
+The demo's lab ships with topoloc. `topoloc simulate` makes the other rendered recordings
+(paper/README.md has the commands). Kitchen, ZED lab and KITTI are in `../shared/data`. A missing
+recording is skipped with a message.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _STREET_1, _STREET_2 = "kitti/sequences/street1@1::2", "kitti/sequences/street2@
 
 @dataclass(frozen=True)
 class AskedPlace:
-    """A map, and of each recording every how manieth picture it is asked about.
+    """Hold a mapping recording, and for each query recording the step between its queried images.
 
-    Names that begin with `demo` are what ships, those without a slash are rendered, the others
+    Names that begin with `demo` ship with topoloc, those without a slash are rendered, the others
     real.
     """
 
@@ -106,8 +106,8 @@ PLACES = (
 
 
 def family_of(name: str) -> str:
-    """The kind of place that a recording shows: poses of one family are never fitted to where they
-    are to be tried."""
+    """Return the kind of place that a recording shows. Poses of one family are never both fitted
+    and tested."""
     return next(family for prefix, family in FAMILIES.items() if name.startswith(prefix))
 
 

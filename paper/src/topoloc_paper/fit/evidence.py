@@ -1,10 +1,10 @@
-"""The weights of the evidence for one pose, and what the errors of a map's points share.
+"""Fit the weights of the evidence for one pose, and the error share common to a map's points.
 
-A logistic regression in which nothing that speaks for a pose may count against it. The evidence of
-one kind of features is much like that of another, and corpora are small: so the weights are drawn
-to those of SURF, as strongly as judges families of places best that they were not fitted to. The
-weight of the doubt is given, not fitted: wrong places in a corridor of many doors come with precise
-poses, and a free weight would follow them to zero.
+The model is a logistic regression with weights that are not negative. Feature types resemble each
+other and corpora are small, so the weights are regularized towards those of SURF. The strength of
+this prior is the one with the best likelihood on held-out families of places. The weight of the
+normalized uncertainty is fixed: wrong places in a corridor with many doors have precise poses, and
+a free weight would become zero.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _INSIDE = 0.95
 
 @dataclass(frozen=True)
 class Judged:
-    """What weights say of some poses: the logarithms of their odds; and which are right."""
+    """Hold the log odds that weights give to some poses, and whether each pose is right."""
 
     family: str
     log_odds: Float[np.ndarray, " n"]
@@ -45,21 +45,22 @@ class Judged:
 
 
 def decided(poses: list[TriedPose]) -> list[TriedPose]:
-    """The poses that are right or wrong; what lies between says nothing."""
+    """Return the poses that are right or wrong, without those in between."""
     return [pose for pose in poses if pose.is_right or pose.is_wrong]
 
 
 def fit_evidence(
     poses: list[TriedPose], prior: EvidenceWeights, strength: float
 ) -> EvidenceWeights:
-    """The weights that tell these poses' right ones from their wrong ones.
+    """Fit the weights that separate right from wrong poses.
 
-    The bias is lowered where a picture from elsewhere would be believed more than it may; a pose is
-    clear that has more for it than the clearest wrong one, by a margin, and no less than with the
-    prior: few poses seldom hold the clearest.
+    The bias is lowered if an out-of-map image would get a higher probability than allowed. A pose
+    is clear if its log odds exceed those of the most probable wrong pose by a margin, and are at
+    least the prior's limit, because a small corpus seldom holds the most probable wrong pose.
 
     Args:
-        prior: what the weights are drawn to, with `strength`; its weight of the doubt is kept.
+        prior: the mean of the regularization, whose weight is `strength`. Its weight of the
+            normalized uncertainty is kept.
     """
     poses = decided(poses)
     fitted = _logistic_regression(poses, prior, strength)
@@ -107,12 +108,11 @@ def _logistic_regression(
 def try_on_others(
     poses: list[TriedPose], prior: EvidenceWeights, strength: float, by_recording: bool = False
 ) -> list[Judged]:
-    """Each family's poses, judged by weights fitted to those that have nothing of it.
+    """Compute the log odds of each family's poses with weights fitted to all other families.
 
     Args:
-        by_recording: instead the poses of each recording that was asked, by those of all others:
-            where only one family has places that look alike, the others cannot tell what a pose in
-            them is worth.
+        by_recording: hold out single recordings instead of families. Use it if only one family has
+            similar places, because the other families do not show the value of a pose in them.
     """
     poses, tried = decided(poses), []
 
@@ -146,7 +146,7 @@ def best_strength(
 
 
 def judged(family: str, poses: list[TriedPose], weights: EvidenceWeights) -> Judged:
-    """What these weights say of these poses."""
+    """Return the log odds of these poses under these weights."""
     odds, is_right = (
         [compute_log_odds(pose.evidence, weights) for pose in poses],
         [pose.is_right for pose in poses],
@@ -155,8 +155,8 @@ def judged(family: str, poses: list[TriedPose], weights: EvidenceWeights) -> Jud
 
 
 def calibration_error(log_odds: Float[np.ndarray, " n"], is_right: Bool[np.ndarray, " n"]) -> float:
-    """Over ten bins of the probability the mean difference of what was said and what was so; of the
-    poses that would be answered."""
+    """Return the mean difference of predicted and observed probability over ten bins, of accepted
+    poses."""
     probability, is_right = 1.0 / (1.0 + np.exp(-log_odds[log_odds > 0])), is_right[log_odds > 0]
     bins = np.minimum((probability * 10).astype(int), 9)
     return float(
@@ -168,14 +168,15 @@ def calibration_error(log_odds: Float[np.ndarray, " n"], is_right: Bool[np.ndarr
 def fit_shared_errors(
     poses: list[TriedPose], before: CorrelatedErrorWeights
 ) -> CorrelatedErrorWeights:
-    """The least rho and the factor with which 95 % of the right poses' errors lie inside the 95 %
-    ellipsoid, none smaller than before.
+    """Fit the least rho and the factor for which the 95 % ellipsoid holds 95 % of the right poses'
+    errors.
 
-    The least is fitted to maps whose own rho is below it, the factor to the others; each to
-    `MIN_RIGHT_POSES` or not at all, for it hangs on the few largest errors.
+    Neither becomes smaller than before. The least rho is fitted to maps whose own rho is below it,
+    the factor to the others. Each needs `MIN_RIGHT_POSES`, because it depends on the few largest
+    errors.
 
     Args:
-        before: the weights with which the poses' rho came about.
+        before: the weights with which the poses' rho was computed.
     """
     right = [pose for pose in poses if pose.is_right and pose.square is not None]
     exact = [pose for pose in right if pose.rho <= before.least]
@@ -195,8 +196,8 @@ def fit_shared_errors(
 
 
 def _least_inflating(poses: list[TriedPose], rhos: list[Float[np.ndarray, " n"]]) -> int:
-    """The first of the choices of rho (growing) that has enough of the poses' errors inside the
-    ellipsoid; the last where none has."""
+    """Return the index of the first rho with enough of the poses' errors inside the ellipsoid, else
+    the last."""
     squares, num = (
         np.array([pose.square for pose in poses]),
         np.array([pose.evidence.num_found for pose in poses]),

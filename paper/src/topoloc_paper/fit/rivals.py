@@ -1,9 +1,8 @@
-"""The weights with which one of two poses of one picture, far from each other, is taken for the
-right one.
+"""Fit the weights that choose between two poses of one image that are far from each other.
 
-Of each picture's poses that are not wrong the strongest is paired with every wrong pose that could
-be taken for it. A pair is hard where the wrong pose comes near to being believed on its own; the
-weights are fitted to hard pairs, by logistic regression without a bias.
+For each image, the strongest pose that is not wrong is paired with every wrong pose of comparable
+strength. A pair is hard if the wrong pose alone is nearly accepted. The weights are fitted to hard
+pairs, by logistic regression without a bias.
 """
 
 from __future__ import annotations
@@ -30,7 +29,8 @@ _SHRINKAGE = 5e-4
 def fit_rivals(
     poses: list[TriedPose], weights: EvidenceWeights, before: RivalWeights
 ) -> tuple[RivalWeights, int]:
-    """The weights, and the number of hard pairs; `before` where these are too few."""
+    """Return the weights and the number of hard pairs; the weights `before` if there are too few
+    pairs."""
     differences, is_hard = pairs_of(poses, weights)
     num_hard = int(np.count_nonzero(is_hard))
     if num_hard < MIN_HARD_PAIRS:
@@ -83,6 +83,6 @@ def num_mistaken(differences: Float[np.ndarray, "n 3"], weights: RivalWeights) -
 
 
 def _terms(pose: TriedPose, weights: EvidenceWeights) -> np.ndarray:
-    """What is weighed between two poses, in the order of the weights."""
+    """Return the compared terms of a pose in the order of the weights."""
     features = EvidenceWeights.features(pose.evidence)
     return np.array([compute_log_odds(pose.evidence, weights), features[0], features[-1]])

@@ -1,5 +1,4 @@
-"""Every pose that a picture led to, not only the one answered, with what spoke for it and whether
-it is right."""
+"""Collect every tested pose of an image, also unreported ones, with its evidence and its error."""
 
 from __future__ import annotations
 
@@ -36,12 +35,12 @@ _NUM_DRAWN = 25
 
 @dataclass(frozen=True)
 class TriedPose:
-    """A pose that a picture led to, and what spoke for it.
+    """Hold a tested pose of an image, and its evidence.
 
-    `error_m`, `error_deg`: None for a picture from elsewhere. `depth`: median distance (metres) of
-    the points that it stands on. `first_evidence`: that of the matches that it came from; None
-    where these were guided. `square`: its squared error in standard deviations of a covariance that
-    takes all matches for independent; `rho` is what the map says of errors that they share.
+    `error_m` and `error_deg` are None for an out-of-map image. `depth` is the median distance
+    (metres) of the pose's points. `first_evidence` is the evidence of its first matches, None if
+    these were guided. `square` is its squared error in standard deviations, with a covariance that
+    takes all matches as independent. `rho` is the error share that the map's points have in common.
     """
 
     mapping: str
@@ -82,11 +81,11 @@ class TriedPose:
 def ask_place(
     place: AskedPlace, recordings: dict[str, StereoSequence], data: Path, kind: str, step: int
 ) -> list[TriedPose]:
-    """Every pose that the place's map, of features of this kind, leads to; none where its recording
-    is missing.
+    """Return every tested pose in the place's map of one feature type, none if the recording is
+    missing.
 
     Args:
-        step: only every so manieth of the place's pictures is asked.
+        step: query only every `step`-th image.
     """
     if place.mapping not in recordings:
         return []
@@ -128,7 +127,7 @@ def save_poses(poses: list[TriedPose], path: Path) -> None:
 
 
 def load_poses(path: Path) -> list[TriedPose]:
-    """What `save_poses` wrote."""
+    """Read the poses that `save_poses` wrote."""
 
     def evidence(saved: dict[str, Any] | None) -> Evidence | None:
         return None if saved is None else Evidence(**saved)

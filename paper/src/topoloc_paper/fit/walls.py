@@ -1,9 +1,9 @@
-"""The weights of the evidence for a pose that the walls along the way let expect.
+"""Fit the weights of the evidence for a pose that a virtual view proposes.
 
-As those of the nodes: a logistic regression in which nothing that speaks for a pose may count
-against it, drawn to the weights in use, for there are few such poses. Whether a pose is precise
-enough is asked apart (`Evidence.precision_probability`), so a wrong one is one of another
-place; the weight of the doubt is given.
+As for nodes, the model is a logistic regression with weights that are not negative. It is
+regularized towards the weights in use, because there are few such poses. The precision of a pose is
+tested separately (`Evidence.precision_probability`), so a wrong pose is one in another place. The
+weight of the normalized uncertainty is fixed.
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ def _is_elsewhere(pose: TriedPose) -> bool:
 
 
 def fit_walls(poses: list[TriedPose], before: VirtualViewWeights) -> tuple[VirtualViewWeights, int]:
-    """The weights, and the number of poses that they were fitted to; `before` and 0 where these are
-    too few."""
+    """Return the weights and the number of fitted poses; `before` and 0 if there are too few."""
     told = told_by_walls(poses)
     is_right = np.array([pose.is_right for pose in told], dtype=bool)
     if min(np.count_nonzero(is_right), np.count_nonzero(~is_right)) < MIN_POSES:

@@ -11,6 +11,7 @@ import numpy as np
 
 from topoloc import (
     Camera,
+    Finding,
     Illumination,
     Image,
     Localization,
@@ -52,7 +53,8 @@ class EvaluatedPose:
 @dataclass(frozen=True, eq=False)
 class Explanation:
     """`poses` are in the order in which they were tried. The most important `advice` is first.
-    `nodes_without_image` are nodes whose image was needed, and is missing or damaged."""
+    `findings` are those of the checks of the likeliest pose, in order. `nodes_without_image` are
+    nodes whose image was needed, and is missing or damaged."""
 
     result: Localization | NotLocalized
     num_features: dict[str, int]
@@ -61,6 +63,7 @@ class Explanation:
     poses: list[EvaluatedPose]
     advice: list[str]
     nodes_without_image: list[int]
+    findings: list[Finding]
 
     @property
     def best(self) -> EvaluatedPose | None:
@@ -94,7 +97,9 @@ def explain(
         if session.light is not None
     }
     light = Illumination.of_image(image)
-    facts = Explanation(result, num_features, light, lights, poses, [], sorted(without))
+    facts = Explanation(
+        result, num_features, light, lights, poses, [], sorted(without), trace.findings
+    )
     return replace(facts, advice=list(dict.fromkeys(_collect_advice(facts, localizer))))
 
 
@@ -114,6 +119,15 @@ def explanation_to_json(name: str, explanation: Explanation) -> dict[str, Any]:
     ]
     return explanation.result.to_json(name) | {
         "advice": explanation.advice,
+        "checks": [
+            {
+                "check": finding.check,
+                "finding": finding.text,
+                "factor": finding.factor,
+                "refused": finding.refusal is not None,
+            }
+            for finding in explanation.findings
+        ],
         "nodes_without_image": explanation.nodes_without_image,
         "num_features": explanation.num_features,
         "tried": poses,

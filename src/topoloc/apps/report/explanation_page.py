@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from topoloc import Image, Localization, TopoMetricMap
+from topoloc import Finding, Image, Localization, TopoMetricMap
 from topoloc.apps.core_names import encode_jpeg
 from topoloc.apps.report.explanation import EvaluatedPose, Explanation
 from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, draw_pair, read_template
@@ -22,6 +22,9 @@ from topoloc.apps.report.page_template import (
 _POSES_TEXT = (
     "Each row is a pose proposal. Found counts the map points that were found again, of all that"
     " must be visible from the pose."
+)
+_CHECKS_TEXT = (
+    "Each check may change the likeliest pose or refuse it. The factor multiplies its probability."
 )
 _PAIRS_TEXT = "Left the image, right the node. Lines are matches that agree with the pose."
 _NO_PAIRS_TEXT = "No part of the map gave a pose. The node is the most similar one."
@@ -39,6 +42,9 @@ _COLUMNS = (
 )
 
 
+_CHECK_COLUMNS = ("check", "finding", "factor")
+
+
 def explanation_page(
     name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap
 ) -> str:
@@ -53,11 +59,14 @@ def explanation_page(
         items = [(render_figure(pair, f"left the image, {words}"), "")]
     rows = [[escape(cell) for cell in row_of(pose)] for pose in explanation.poses]
     table = render_table(_COLUMNS, rows, "tried", "What was tried")
+    checks = [[escape(cell) for cell in check_row(finding)] for finding in explanation.findings]
+    checks_table = render_table(_CHECK_COLUMNS, checks, "checks", "What was checked")
     pairs_text = _PAIRS_TEXT if shown else _NO_PAIRS_TEXT
     sections = [
         render_section("Advice", "", f"<ul>{advice or '<li>No problem was found.</li>'}</ul>"),
         render_section("Comparison with the map", pairs_text, render_gallery_items(items)),
         render_section("What was tried", _POSES_TEXT, table),
+        render_section("What was checked", _CHECKS_TEXT, checks_table),
     ]
     outcome = "was localized" if explanation.result.localized else "was not localized"
     return render_page(f"Why {name} {outcome}", verdict(explanation), "".join(sections))
@@ -147,3 +156,9 @@ def row_of(pose: EvaluatedPose) -> tuple[str, ...]:
         probability = "" if pose.probability is None else f"{pose.probability:.2f}"
         evidence = (found, str(e.num_by_chance), unguided, probability)
     return (pose.tried.source, pose.tried.features, node, first, *evidence, pose.verdict)
+
+
+def check_row(finding: Finding) -> tuple[str, str, str]:
+    """Return the cells of a check in the order of `_CHECK_COLUMNS`."""
+    text = f"refused: {finding.text}" if finding.refusal else finding.text
+    return finding.check, text, f"{finding.factor:.2g}"

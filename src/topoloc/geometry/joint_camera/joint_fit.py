@@ -212,7 +212,7 @@ def clustered_noise(
     of: slice,
 ) -> float:
     """Return the factor of the variance of some parameters (focal length and principal point, say)
-    by errors that are common to parts of the image, at least 1 (see `clustered_errors.py`)."""
+    by errors that are common to parts of the image, at least 1 (see `pose_matches.py`)."""
     used, number = np.unique(cells, return_inverse=True)
     if len(used) < 8:
         return 1.0

@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.atlas.atlas import Atlas, absolute_address
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins
-from topoloc.atlas.joins import Join
-from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
+from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M, Join
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError, MapError, TrajectoryError
@@ -177,8 +176,7 @@ def join_tiles(
         selected = [(atlas.tile(a), atlas.tile(b)) for a, b in ordered if (a, b) not in known]
     pair_results = list[PairResult]()
     if run_jobs is not None:
-        address = absolute_address(where)
-        jobs = [PairJob(address, first.tile_id, second.tile_id) for first, second in selected]
+        jobs = [PairJob(atlas.address, first.tile_id, second.tile_id) for first, second in selected]
         pair_results = run_jobs(jobs) if jobs else []
     else:
         with closing(MapCache([], Localizer, _MAX_BYTES)) as maps:

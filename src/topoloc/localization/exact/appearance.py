@@ -9,7 +9,7 @@ are correlated, less a quadratic function of the pixel.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -19,11 +19,12 @@ from msgspec import Struct
 
 from topoloc.errors import FeatureTypeError
 from topoloc.json_data import Finite, decode_json
+from topoloc.localization.answer import Answer, Finding
 from topoloc.localization.evidence import sample_rows
 from topoloc.localization.exact.patch_alignment import sample_colours, small_colours
 from topoloc.localization.guided import select_visible_points
+from topoloc.localization.map_query import MapQuery
 from topoloc.localization.result import Localization
-from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search
 from topoloc.node_ids import NodeId
 
@@ -153,24 +154,26 @@ def _correlate(
     return None if is_grey else ColourAgreement(float(correlation), light_change, contrast)
 
 
-def weigh_appearance(search: Search, outcome: ResultWithInliers) -> ResultWithInliers:
-    """Return the outcome with the appearance of its pose, which the probability includes.
+def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
+    """Compare the colours in view with those of the map. The probability includes that of another
+    floor.
 
     Without colours nothing tells floors apart, and a map with look-alike floors is honest about it.
     """
-    found, named = outcome
-    if not isinstance(found, Localization) or not search.query.grey.any():  # only features
-        return outcome
+    found, search = answer.pose, query.searches[0]
+    if found is None or not search.query.grey.any():  # only features
+        return None
     with search.query.clock.stage("appearance"):
         agreement = compare_colours(search, found) if found.is_of_nodes else None
     appearance, has_look_alikes = None, search.map.topomap.config.look_alike_floors
+    text = "no colours can be compared"
     if agreement is not None:
         # where floors look alike, a clear pose tells no floor
         certainty = 0.0 if has_look_alikes else found.probability
         appearance = agreement.appearance(certainty, load_appearance_weights())
+        text = f"the colours agree with this floor with a probability of {appearance:.2g}"
     share = share_of_this_floor(appearance, has_look_alikes)
-    found = replace(found, appearance=appearance, probability=share * found.probability)
-    return found, [(found, points) for _, points in named]
+    return Finding("colours", text, share, {"appearance": appearance})
 
 
 def share_of_this_floor(appearance: float | None, has_look_alikes: bool) -> float:

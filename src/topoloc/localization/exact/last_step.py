@@ -17,12 +17,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from topoloc.geometry.absolute_pose import AbsolutePose, refine_absolute_pose
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import compute_variance_inflation
+from topoloc.geometry.camera import Camera, UncalibratedCamera
+from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.answer import Answer, Finding, lead
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.exact.appearance import weigh_appearance
 from topoloc.localization.exact.patch_alignment import (
     LastStepWeights,
     PreciseMatches,
@@ -32,10 +31,10 @@ from topoloc.localization.exact.patch_alignment import (
 )
 from topoloc.localization.fitted_weights import EvidenceWeights
 from topoloc.localization.guided import match_guided
+from topoloc.localization.map_query import MapQuery
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization
-from topoloc.localization.result_decision import ResultWithInliers, decide_final_result
 from topoloc.localization.search import Search
 
 
@@ -51,21 +50,6 @@ class PreciseFit:
 def _is_from_nodes(search: Search, evidence: Evidence | None) -> bool:
     """Return whether nodes, and not virtual views, show what a pose was found by."""
     return evidence is not None and isinstance(search.weights.of(evidence), EvidenceWeights)
-
-
-def make_precise(
-    searches: Sequence[Search], outcome: ResultWithInliers, has_prior: bool
-) -> ResultWithInliers:
-    """Return the outcome with a second look at a refusal, and with its pose refined.
-
-    Args:
-        searches: the searches of the query, one for each feature type.
-        has_prior: only the surroundings of a prior pose were searched, where a similar place may
-            stand. A refusal then remains.
-    """
-    if not has_prior:
-        outcome = _reconsider_refusal(searches, outcome)
-    return weigh_appearance(searches[0], _refine_result(searches, outcome))
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
@@ -85,22 +69,21 @@ def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
     )
 
 
-def _reconsider_refusal(
-    searches: Sequence[Search], outcome: ResultWithInliers
-) -> ResultWithInliers:
-    """Return the outcome after a second look at the hypotheses, if a refusal is nearly a pose.
+def look_again(query: MapQuery, answer: Answer) -> Finding | None:
+    """Look again at the hypotheses of a refusal, because one of them is nearly a pose.
 
     In bad light few unguided matches agree with the right pose, but the guided ones of all nodes
-    and feature types crowd around their predictions. Those of a wrong pose do not.
+    and feature types crowd around their predictions. Those of a wrong pose do not. If a prior pose
+    limits the search, a similar place may stand there, and the refusal remains.
     """
-    result, weights = outcome[0], load_last_step_weights()
+    searches, weights = query.searches, load_last_step_weights()
     if (
-        isinstance(result, Localization)
-        or result.reason == "ambiguous"
-        or any(search.is_refuted for search in searches)
+        query.prior is not None
+        or isinstance(answer.result, Localization)
+        or answer.result.reason == "ambiguous"
         or not _can_refine(searches, weights)
     ):
-        return outcome
+        return None
     crowded, others = list[tuple[Hypothesis, Search]](), list[Hypothesis]()
     for search in searches:
         ordered = [search, *(other for other in searches if other is not search)]
@@ -114,39 +97,40 @@ def _reconsider_refusal(
             else:
                 others.append(one)
     if not crowded:
-        return outcome
+        return None
     best, search = max(crowded, key=lambda one: one[0].log_odds)
     belief = Belief()
     for one in [*(one for one, _ in crowded), *others]:
         belief = belief.with_hypothesis(one, search.config.evidence, search.weights.rivals)
     if belief.best(search.weights.rivals) is not best:
-        return outcome
-    reconsidered = decide_final_result(replace(search, belief=belief))
-    return reconsidered if isinstance(reconsidered[0], Localization) else outcome
+        return None
+    reconsidered = lead(replace(search, belief=belief))
+    text = "the matches of all nodes crowd around their predictions"
+    return Finding("second look", text, answer=reconsidered) if reconsidered.pose else None
 
 
-def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
-    """Return the outcome with its pose refined, or unchanged if too few points agree.
+def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
+    """Refine the pose of an answer with all nodes around it, unless too few points agree.
 
     Nodes near a pose from virtual views show something else. A calibration in doubt and a rotation
     during a rolling shutter would have to be estimated with the pose.
     """
-    result, first = outcome[0], searches[0]
+    pose, searches, first = answer.pose, query.searches, query.searches[0]
     weights = load_last_step_weights()
     if (
-        not isinstance(result, Localization)
-        or not _is_from_nodes(first, result.evidence)
-        or result.calibration_doubt is not None
-        or result.frame_rotation_deg is not None
+        pose is None
+        or not _is_from_nodes(first, pose.evidence)
+        or pose.calibration_doubt is not None
+        or pose.frame_rotation_deg is not None
         or not _can_refine(searches, weights)
     ):
-        return outcome
+        return None
     # the feature type that found the pose comes first
-    ordered = sorted(searches, key=lambda one: one.map.kind.name != result.provenance.features)
+    ordered = sorted(searches, key=lambda one: one.map.kind.name != pose.provenance.features)
     with first.query.clock.stage("last_step"):
-        fit = refine_precisely(ordered, result.world_from_cam.inverse(), weights)
+        fit = refine_precisely(ordered, pose.world_from_cam.inverse(), weights)
         if fit is None:
-            return outcome
+            return None
         seen = fit.matches.select(np.flatnonzero(fit.pose.inliers))
         parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
         cam_from_world = fit.pose.cam_from_world
@@ -154,20 +138,19 @@ def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> Re
             *parts, first.query.camera, cam_from_world, seen.sigmas_px
         )
     noise = inflation**2 * fit.pose.covariance
-    before = inverse_covariance(result.world_from_cam, result.covariance)
-    shared = (1.0 - result.noise_share) * before  # key points share the errors of the verdict's
+    before = inverse_covariance(pose.world_from_cam, pose.covariance)
+    shared = (1.0 - pose.noise_share) * before  # key points share the errors of the verdict's
     if fit.is_aligned:
         # the less the nodes contradict each other, the more of their errors average out
         shared *= min(1.0, weights.shared_error_slope * first.correlated_error_share)
         shared += np.dot(weights.slow_errors, (1.0, 1.0 / len(seen))) * noise
-    precise = replace(
-        result,
-        world_from_cam=cam_from_world.inverse(),
-        covariance=inverse_covariance(cam_from_world, noise + shared),
-        noise_share=float(np.trace(noise[:3, :3]) / np.trace((noise + shared)[:3, :3])),
-        times_ms=first.query.clock.times_ms(),
-    )
-    return precise, [(precise, seen.to_image_scale(first.query.scale))]
+    facts = {
+        "world_from_cam": cam_from_world.inverse(),
+        "covariance": inverse_covariance(cam_from_world, noise + shared),
+        "noise_share": float(np.trace(noise[:3, :3]) / np.trace((noise + shared)[:3, :3])),
+    }
+    points, text = seen.to_image_scale(first.query.scale), f"refined with {len(seen)} points"
+    return Finding("exact pose", text, facts=facts, points=points)
 
 
 def refine_precisely(

@@ -27,7 +27,8 @@ from topoloc.localization.fitted_weights import CorrelatedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.nodes import compute_nodes_digest, node_distances
-from topoloc.mapping.topomap import CorrelatedErrors, TopoMetricMap, TopoNode
+from topoloc.mapping.storage.entries import CorrelatedErrors
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import as_rows
 
 _MEDIAN_CHI_SQUARE_6 = 5.348

@@ -22,7 +22,8 @@ from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
 from topoloc.mapping.config import Progress
-from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
+from topoloc.mapping.storage.entries import CorrelatedErrors
+from topoloc.mapping.topomap import Repetitions, TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.recordings.damaged_images import leave_out_damaged
 from topoloc.recordings.frame import StereoSequence

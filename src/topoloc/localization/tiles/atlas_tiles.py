@@ -14,17 +14,16 @@ from msgspec import structs
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.joins import sigmas_at
+from topoloc.atlas.joint_worlds import sigmas_at
 from topoloc.atlas.location_prior import LocationPrior, tiles_in_reach
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.tile_fetcher import RETRY_AFTER_S
 from topoloc.errors import AtlasError, MapError
 from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig, find_available_types
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image

@@ -15,19 +15,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from topoloc.errors import AtlasError, MapError
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
-from topoloc.localization.map_context import MapContext
-from topoloc.localization.provenance import Evidence
-from topoloc.localization.query import QueryImage, StageClock
-from topoloc.localization.result import Alternative, Localization, NotLocalized, R
-from topoloc.localization.result_decision import (
-    MIN_ALTERNATIVE_RATIO,
+from topoloc.localization.answer import (
+    Answer,
     LocalizationWithInliers,
     ResultWithInliers,
+    refuse,
 )
+from topoloc.localization.belief import select_probable, share_probability
+from topoloc.localization.map_context import MapContext
+from topoloc.localization.query import QueryImage, StageClock
+from topoloc.localization.result import Alternative, Localization, NotLocalized, R
 
 if TYPE_CHECKING:
     from topoloc.atlas.location_prior import LocationPrior
@@ -116,30 +115,29 @@ def ranking_margin(ranking: TileRanking) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class TileResult:
-    """Hold the result of a tile and each reported pose with its inliers.
+class TileAnswer:
+    """Hold the answer of a tile.
 
     `is_exhaustive` is True after an exhaustive search. `similarity` is the tile's rank score.
     """
 
     tile_id: str
-    result: Localization | NotLocalized
-    poses: list[LocalizationWithInliers]
+    answer: Answer
     is_exhaustive: bool
     similarity: float = 0.0
 
     @property
     def is_clear(self) -> bool:
         """Return whether the tile's pose is clear."""
-        return isinstance(self.result, Localization) and (
-            _weights(self.result).evidence.is_clear(_log_odds(self.result))
-        )
+        best, search = self.answer.best, self.answer.search
+        if self.answer.pose is None or best is None:
+            return False
+        return search.weights.evidence.is_clear(best.log_odds)
 
     @property
     def localized(self) -> Localization | None:
         """Return the pose that an exhaustive search found, None if there is none."""
-        found = self.result if self.is_exhaustive else None
-        return found if isinstance(found, Localization) else None
+        return self.answer.pose if self.is_exhaustive else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,141 +149,76 @@ class _Rival:
     margin: float
 
 
-def merge_tile_results(tiles: Tiles, results: Sequence[TileResult]) -> ResultWithInliers:
-    """Merge the results of several tiles into one.
+def merge_answers(tiles: Tiles, answers: Sequence[TileAnswer]) -> ResultWithInliers:
+    """Merge the answers of several tiles into one result.
 
-    The first reported pose of a tile represents it. If no tile localized the image, the most
-    informative refusal is returned.
+    A pose must lead those of all other tiles by the margin that is required within a map. If no
+    tile localized the image, the most informative refusal is returned.
 
     Raises:
         AtlasError: no tile could be searched.
     """
-    if not results:
+    if not answers:
         reason = next(iter(tiles.problems.values()), "no time")
         raise AtlasError(f"no tile of the atlas can be searched: {reason}")
-    tile_id, result, poses = _merge(tiles, results)
-    return tiles.with_tile(result, tile_id), poses
-
-
-def _merge(
-    tiles: Tiles, results: Sequence[TileResult]
-) -> tuple[str, Localization | NotLocalized, list[LocalizationWithInliers]]:
-    """Return the tile of the result, the result, and its reported poses."""
-    if len(results) == 1:
-        return results[0].tile_id, results[0].result, results[0].poses
     localized = [
-        (one, found, _rivals(tiles, one, found, results))
-        for one in results
-        if (found := one.localized) is not None
+        (one, pose, _rivals(tiles, one, pose, answers))
+        for one in answers
+        if (pose := one.localized) is not None
     ]
     if not localized:
-        return _best_refusal(results)
-    best, found, rivals = max(
+        refused = [one for one in answers if one.answer.pose is None]
+        best = max(refused or answers, key=_num_facts)
+        return tiles.with_tile(best.answer.result, best.tile_id), best.answer.poses
+    best, pose, rivals = max(
         localized, key=lambda one: min((rival.margin for rival in one[2]), default=math.inf)
     )
     if not rivals:
-        return best.tile_id, found, best.poses
-    others = 1.0 / max(found.probability, 1e-6) - 1.0
-    others += sum(math.exp(-rival.margin) for rival in rivals)
-    if all(rival.margin >= _weights(found).rivals.lead for rival in rivals):
-        found = replace(found, probability=1.0 / (1.0 + others))
-        return best.tile_id, found, [(found, seen) for _, seen in best.poses]
-    return best.tile_id, *_ambiguous_result(best, found, rivals, others)
-
-
-def is_negligible_rival(evidence: Evidence, features: str, answer: Localization) -> bool:
-    """Return whether a pose with this evidence is too improbable to be reported as an
-    alternative."""
-    weights = load_fitted_weights(features)
-    log_odds = weights.log_odds(evidence)
-    by = _log_odds_margin(answer, features, log_odds, weights.rivals.score(evidence, log_odds))
-    return by > -math.log(MIN_ALTERNATIVE_RATIO)
+        return tiles.with_tile(pose, best.tile_id), best.answer.poses
+    margins = [rival.margin for rival in rivals]
+    shares = share_probability(1.0 / max(pose.probability, 1e-6) - 1.0, margins)
+    if min(margins) >= best.answer.search.weights.rivals.lead:
+        pose = replace(pose, probability=shares[0])
+        return tiles.with_tile(pose, best.tile_id), [(pose, best.answer.poses[0][1])]
+    return _ambiguous_result(tiles, best, rivals, shares)
 
 
 def _rivals(
-    tiles: Tiles, one: TileResult, found: Localization, results: Sequence[TileResult]
+    tiles: Tiles, one: TileAnswer, pose: Localization, answers: Sequence[TileAnswer]
 ) -> list[_Rival]:
     """Return the poses of other tiles that differ from the pose of this tile."""
     rivals = list[_Rival]()
-    for other in (other for other in results if other is not one):
-        for pose, seen in other.poses:
-            if not tiles.may_be_same_pose(one.tile_id, found, other.tile_id, pose):
-                scores = _log_odds(pose), _rival_score(pose)
-                margin = _log_odds_margin(found, pose.provenance.features, *scores)
-                rivals.append(_Rival(other.tile_id, (pose, seen), margin))
+    for other in (other for other in answers if other is not one):
+        for named, hypothesis in zip(other.answer.poses, other.answer.hypotheses, strict=True):
+            if not tiles.may_be_same_pose(one.tile_id, pose, other.tile_id, named[0]):
+                margin = one.answer.margin_over(other.answer.search, hypothesis)
+                rivals.append(_Rival(other.tile_id, named, margin))
     return rivals
 
 
 def _ambiguous_result(
-    best: TileResult, found: Localization, rivals: Sequence[_Rival], others: float
-) -> tuple[NotLocalized, list[LocalizationWithInliers]]:
+    tiles: Tiles, best: TileAnswer, rivals: Sequence[_Rival], shares: list[float]
+) -> ResultWithInliers:
     """Return an ambiguous result with the probability of each alternative."""
-    shares = [(1.0 / (1.0 + others), best.tile_id, best.poses[0])]
-    shares += [(math.exp(-one.margin) / (1.0 + others), one.tile_id, one.pose) for one in rivals]
-    probable = sorted(
-        (one for one in shares if one[0] >= MIN_ALTERNATIVE_RATIO * shares[0][0]),
-        key=lambda one: -one[0],
-    )
+    found = [(best.tile_id, best.answer.poses[0]), *((one.tile_id, one.pose) for one in rivals)]
+    probable = select_probable(found, shares)
     alternatives = tuple(
         Alternative(pose.world_from_cam, probability, pose.node_id, pose.geopose, tile_id)
-        for probability, tile_id, (pose, _) in probable
+        for (tile_id, (pose, _)), probability in probable
     )
-    refusal = NotLocalized(
-        "ambiguous",
-        found.candidates,
-        found.num_matches,
-        found.num_inliers,
-        {},
-        f"as much like tile {alternatives[1].tile} as like tile {alternatives[0].tile}",
-        alternatives,
-        found.provenance,
-        found.seen_camera,
-    )
-    return refusal, [
-        (replace(pose, probability=probability), seen) for probability, _, (pose, seen) in probable
+    detail = f"as much like tile {alternatives[1].tile} as like tile {alternatives[0].tile}"
+    pose = best.answer.poses[0][0]
+    refusal = refuse(best.answer.search, pose, "ambiguous", detail)
+    refusal = replace(refusal, alternatives=alternatives)
+    poses = [
+        (replace(pose, probability=probability), seen)
+        for (_, (pose, seen)), probability in probable
     ]
+    return tiles.with_tile(refusal, best.tile_id), poses
 
 
-def _best_refusal(
-    results: Sequence[TileResult],
-) -> tuple[str, NotLocalized, list[LocalizationWithInliers]]:
-    """Return the most informative refusal: one with alternatives, or with the most inliers."""
-    best, result = max(
-        [(one, result) for one in results if isinstance(result := one.result, NotLocalized)],
-        key=lambda one: (
-            one[0].is_exhaustive,
-            one[1].reason == "ambiguous",
-            one[1].num_inliers,
-            one[0].similarity,
-        ),
-    )
-    return best.tile_id, result, best.poses
-
-
-def _log_odds_margin(a: Localization, features: str, log_odds: float, rival_score: float) -> float:
-    """Return the log-odds margin of a pose over one with these log-odds and this score.
-
-    It is the difference of rival scores, which separate similar places, if both use the same
-    feature type. Otherwise, or for virtual views, it is the difference of log-odds.
-    """
-    is_alike = features == a.provenance.features
-    margin = _rival_score(a) - rival_score if is_alike else math.nan
-    return _log_odds(a) - log_odds if math.isnan(margin) else margin
-
-
-def _rival_score(result: Localization) -> float:
-    """Return the rival score of a pose, as in `belief.log_odds_margin`."""
-    if result.evidence is None:
-        return _log_odds(result)
-    return _weights(result).rivals.score(result.evidence, _log_odds(result))
-
-
-def _log_odds(result: Localization) -> float:
-    """Return the log-odds of the pose against "not in the map"."""
-    if result.evidence is None:
-        return math.log(max(result.probability, 1e-9) / max(1.0 - result.probability, 1e-9))
-    return _weights(result).log_odds(result.evidence)
-
-
-def _weights(result: Localization) -> FittedWeights:
-    return load_fitted_weights(result.provenance.features)
+def _num_facts(one: TileAnswer) -> tuple[bool, bool, int, float]:
+    """Return the sort key of refusals: the most informative one is the largest."""
+    result = one.answer.result
+    is_ambiguous = isinstance(result, NotLocalized) and result.reason == "ambiguous"
+    return one.is_exhaustive, is_ambiguous, result.num_inliers, one.similarity

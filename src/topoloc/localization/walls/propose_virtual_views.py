@@ -21,8 +21,8 @@ import numpy as np
 from topoloc.features.config import MatchingConfig
 from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
+from topoloc.geometry.camera import UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import measure_evidence
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose

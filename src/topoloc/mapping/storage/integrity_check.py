@@ -1,27 +1,21 @@
-"""Check a whole map file: the checksum of every row, the digest, and the content of every entry.
-Also describe its contents in numbers and words."""
+"""Check a whole map file: the checksum of every row, the digest, and the content of every
+entry."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from topoloc.errors import EmptyMapError, MapError
-from topoloc.json_data import decode_json
+from topoloc.errors import MapError
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
 from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.storage.map_file import MapFile
 from topoloc.mapping.storage.map_writing import compute_map_digest
 from topoloc.mapping.storage.schema import SORT_COLUMNS, TABLES
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.validation import CorruptDataError
 from topoloc.retrieval.coarse import open_coarse_localizer
 
 
@@ -35,58 +29,6 @@ def find_map_damage(path: Path) -> list[str]:
     with TopoMetricMap.load(path) as topomap, closing(MapFile(path)) as file:
         found = [*_check_rows(file), *_check_entries(topomap)]
     return list(dict.fromkeys(text.removeprefix(f"map {path} is damaged: ") for text in found))
-
-
-def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
-    """Return the facts of a map for evaluations and `info`: counts, bytes, extent, configuration.
-
-    Raises:
-        EmptyMapError: the map has no node.
-    """
-    if len(topomap.summaries) == 0:
-        raise EmptyMapError(f"map {path} has no nodes")
-    models = list_coarse_models(path)
-    centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
-    num_nodes = Counter(summary.session_id for summary in topomap.summaries)
-    return {
-        "path": str(path),
-        "map": topomap.id,
-        "version": topomap.version,
-        "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
-        "certificate": topomap.describe_certificate(),
-        "bytes": path.stat().st_size,
-        "num_nodes": len(topomap.summaries),
-        "num_points": sum(s.num_points for s in topomap.summaries),
-        "num_side_nodes": len(topomap.sides.summaries) if topomap.sides else 0,
-        "num_place_images": len(topomap.place_images),
-        "length_m": round(topomap.length_m, 3),
-        "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
-        "recordings": sorted({s.recording for s in topomap.summaries}),
-        "sessions": [
-            asdict(session)
-            | {
-                "camera": None if session.camera is None else session.camera.to_json(),
-                "start_date": session.start_date,
-                "end_date": session.end_date,
-                "num_nodes": num_nodes[session.session_id],
-            }
-            for session in topomap.sessions
-        ],
-        "edits": [asdict(edit) for edit in topomap.edits],
-        "coarse": [model["name"] for model in models],
-        "default_coarse": topomap.default_coarse,
-        "kinds": topomap.kinds,
-        "coarse_models": models,
-        "config": topomap.config.to_json(),
-    }
-
-
-def list_coarse_models(path: Path) -> list[dict[str, Any]]:
-    """Return the name, bytes, backbone and weights of each coarse localizer of a map file. Raises
-    MapError."""
-    query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
-    with closing(MapFile(path)) as file, file.read_connection() as database:
-        return [_model_facts(*row) for row in database.execute(query)]
 
 
 def _check_rows(file: MapFile) -> Iterator[str]:
@@ -137,10 +79,3 @@ def _try_read(read: Callable[[], Any]) -> tuple[Any, list[str]]:
         return None, [str(error)]
     except KeyError as error:  # raised by `row_of`
         return None, [f"node {error} is missing"]
-
-
-def _model_facts(name: str, text: str, num_bytes: int) -> dict[str, Any]:
-    settings = decode_json(text, dict[str, Any], CorruptDataError, f"coarse localizer {name}")
-    return {"name": name, "bytes": num_bytes} | {
-        key: settings[key] for key in ("backbone", "weights", "trained") if key in settings
-    }

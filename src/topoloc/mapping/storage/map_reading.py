@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,14 +19,17 @@ from topoloc.json_data import Finite, decode_json
 from topoloc.mapping.certificate import Certificate
 from topoloc.mapping.config import CONFIG_VERSION, config_from_text
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
-from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.storage.entries import (
     CorrelatedErrors,
     Edge,
+    Edit,
+    Layer,
     LazyMapping,
+    NextIds,
     NodeSummary,
     PlaceImage,
     Repetitions,
+    Session,
     TopoNode,
     VirtualNodes,
 )
@@ -37,7 +41,6 @@ from topoloc.mapping.storage.schema import (
     layer_suffix,
     split_layer_name,
 )
-from topoloc.mapping.topomap import Layer, NextIds, TopoMetricMap
 from topoloc.mapping.validation import (
     MAX_POINTS,
     CorruptDataError,
@@ -51,21 +54,19 @@ T = TypeVar("T")
 MAX_ID = 2**53
 
 
-def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
-    """Open a map file without reading its nodes. It stays open. Raises MapError and
-    MapVersionError as `MapFile`."""
+def open_contents(path: Path, digest: str | None = None) -> tuple[MapFile, dict[str, Any]]:
+    """Open a map file and return it with the fields of its `TopoMetricMap`, without reading the
+    nodes. It stays open. Raises MapError and MapVersionError as `MapFile`."""
     file = MapFile(path, digest)
     try:
         with file.read_connection():
-            topomap = _read_contents(file)
-            topomap.__dict__["_opened"] = file  # not a field, so that a changed copy has no file
-            return topomap
+            return file, _read_fields(file)
     except BaseException:
         file.close()
         raise
 
 
-def _read_contents(file: MapFile) -> TopoMetricMap:
+def _read_fields(file: MapFile) -> dict[str, Any]:
     facts = file.facts
     for key in ("config", "length_m"):
         if key not in facts:
@@ -84,23 +85,40 @@ def _read_contents(file: MapFile) -> TopoMetricMap:
     moves = _lazy_entries(file, "repetitions", moves_from_row)
     of_earth = facts.get("georeference")
     changes = _decode_fact(facts, "changes", dict[str, dict[str, Any]], {})
-    return TopoMetricMap(
-        summaries=_lazy_rows(file, "nodes", _read_summary, ""),
-        layers={kind: _read_layer(file, kind, config.features.kind) for kind in kinds},
-        edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
-        place_images=_lazy_rows(file, "place_images", _read_place_image),
-        config=config,
-        length_m=_decode_fact(facts, "length_m", Finite, 0.0),
-        default_coarse=_decode_fact(facts, "default_coarse", str, "surf-vlad"),
-        repetitions=Repetitions(facts["repetitions"], moves) if "repetitions" in facts else None,
-        sides=_read_virtual_nodes(file, kinds),
-        sessions=list(_read_sessions(file).values()),
-        edits=[Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")],
-        next_ids=parse_settings(NextIds, _decode_fact(facts, "next_ids", dict, {}), "next_ids"),
-        map_id=map_id,
-        georeference=None if of_earth is None else Georeference.from_json(of_earth),
-        certificate=_decode_fact(facts, "certificate", Certificate, None),
-    )
+    return {
+        "summaries": _lazy_rows(file, "nodes", _read_summary, ""),
+        "layers": {kind: _read_layer(file, kind, config.features.kind) for kind in kinds},
+        "edges": [Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
+        "place_images": _lazy_rows(file, "place_images", _read_place_image),
+        "config": config,
+        "length_m": _decode_fact(facts, "length_m", Finite, 0.0),
+        "default_coarse": _decode_fact(facts, "default_coarse", str, "surf-vlad"),
+        "repetitions": Repetitions(facts["repetitions"], moves) if "repetitions" in facts else None,
+        "sides": _read_virtual_nodes(file, kinds),
+        "sessions": list(_read_sessions(file).values()),
+        "edits": [
+            Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")
+        ],
+        "next_ids": parse_settings(NextIds, _decode_fact(facts, "next_ids", dict, {}), "next_ids"),
+        "map_id": map_id,
+        "georeference": None if of_earth is None else Georeference.from_json(of_earth),
+        "certificate": _decode_fact(facts, "certificate", Certificate, None),
+    }
+
+
+def list_coarse_models(path: Path) -> list[dict[str, Any]]:
+    """Return the name, bytes, backbone and weights of each coarse localizer of a map file. Raises
+    MapError."""
+    query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
+    with closing(MapFile(path)) as file, file.read_connection() as database:
+        return [_model_facts(*row) for row in database.execute(query)]
+
+
+def _model_facts(name: str, text: str, num_bytes: int) -> dict[str, Any]:
+    settings = decode_json(text, dict[str, Any], CorruptDataError, f"coarse localizer {name}")
+    return {"name": name, "bytes": num_bytes} | {
+        key: settings[key] for key in ("backbone", "weights", "trained") if key in settings
+    }
 
 
 def _decode_fact(facts: Mapping[str, str], key: str, kind: Any, default: T) -> T:

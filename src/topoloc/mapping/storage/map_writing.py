@@ -9,21 +9,24 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from topoloc.errors import MapError
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import encode_statistics
-from topoloc.mapping.sessions import Session
-from topoloc.mapping.storage.entries import TopoNode
+from topoloc.mapping.storage.entries import Session, TopoNode
+from topoloc.mapping.storage.kept_files import drop_kept_files, keep_file
+from topoloc.mapping.storage.map_lock import WaitCallback, no_edit_of
 from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
 from topoloc.mapping.storage.schema import (
     APPLICATION_ID,
@@ -35,13 +38,49 @@ from topoloc.mapping.storage.schema import (
     create_table_statement,
     layer_suffix,
 )
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.validation import sqlite_failures_as_os_errors
+from topoloc.mapping.validation import describe_failure, sqlite_failures_as_os_errors
+from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.coarse import CoarseModel
+
+if TYPE_CHECKING:
+    from topoloc.mapping.topomap import TopoMetricMap
 
 _PAGE_BYTES = 1024
 """A row leaves half of its last page empty on average, and a node has about eight rows. Larger
 pages cost 1 to 5 kB more per node."""
+
+
+def save_map(
+    topomap: TopoMetricMap,
+    path: Path,
+    on_wait: WaitCallback | None = None,
+    is_old_kept: bool = True,
+) -> None:
+    """Write the map to `path` atomically. A reader sees the old map or the new one. A file that is
+    replaced is kept, if `is_old_kept`. Waits while another process edits the map at `path`, and
+    calls `on_wait` once before.
+
+    Raises:
+        MapError: the folder does not exist or cannot be written, the disk is full, or this thread
+            edits the map at `path`. Nothing is left behind.
+    """
+    if os.path.isdir(path):  # Path.is_dir raises an error for names that are too long
+        raise MapError(f"cannot write map {path}: it is a folder")
+    kept = None
+    try:
+        with no_edit_of(path, on_wait), atomic_write(path) as temporary:
+            write_map(topomap, temporary)
+            if is_old_kept and os.path.isfile(path):
+                kept = keep_file(Path(os.path.realpath(path)), temporary)
+    except (OSError, ValueError) as error:
+        if kept is not None:
+            kept.unlink(missing_ok=True)
+        # a null character in the name; any other ValueError is a bug
+        if isinstance(error, ValueError) and "null" not in str(error):
+            raise
+        raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
+    if kept is not None:
+        drop_kept_files(Path(os.path.realpath(path)), kept)
 
 
 def write_map(topomap: TopoMetricMap, path: Path) -> None:

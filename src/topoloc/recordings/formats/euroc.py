@@ -24,9 +24,9 @@ from topoloc.recordings.calibration import (
     first_image_size,
     replace_cameras,
 )
+from topoloc.recordings.camera_files import kalibr_camera, read_yaml, require_numbers
 from topoloc.recordings.format import RecordingFormat, match_times
 from topoloc.recordings.recording import Recording, RightImages
-from topoloc.recordings.stereo_yaml import kalibr_camera, read_yaml, require_numbers
 from topoloc.recordings.text_files import read_file_list, read_rows
 from topoloc.recordings.trajectory import Trajectory, timed_trajectory
 

@@ -20,7 +20,7 @@ from topoloc.recordings.calibration import (
     first_image_size,
     parse_calibration,
 )
-from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration
+from topoloc.recordings.camera_files import FILE_NAME, CameraCalibration
 from topoloc.recordings.format import (
     RecordingFormat,
     complete_lists,

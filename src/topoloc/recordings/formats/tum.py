@@ -14,7 +14,7 @@ from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import CalibrationForSize, first_image_size
-from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration, read_camera_json
+from topoloc.recordings.camera_files import FILE_NAME, CameraCalibration, read_camera_json
 from topoloc.recordings.format import RecordingFormat, match_times, read_ground_truth
 from topoloc.recordings.recording import DepthImages, Recording
 from topoloc.recordings.text_files import read_file_list

@@ -21,7 +21,7 @@ import cv2
 from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
+from topoloc.recordings.camera_files import FILE_NAME, read_camera_json
 from topoloc.recordings.format import RecordingFormat, read_ground_truth
 from topoloc.recordings.frame import Image, IndexedFrames, StereoFrame
 

@@ -1,4 +1,4 @@
-"""`topoloc map`: a map that grows while its recording is replayed or written."""
+"""Test `topoloc map`: the map grows while its recording is replayed or written."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OPTIONS = ("--piece", "30", "--features", "surf")
 
 
 def record_walk(folder: Path, indices: list[float]) -> Path:
-    """A recording without truth, twenty pairs a second."""
+    """Write a recording without ground truth, with twenty stereo pairs per second."""
     write_stereo_recording(folder, indices=indices)
     (folder / "truth.tum").unlink()
     (folder / "times.txt").write_text("".join(f"{k / 20:.9f}\n" for k in range(len(indices))))
@@ -39,12 +39,13 @@ def record_walk(folder: Path, indices: list[float]) -> Path:
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A walk there and back, 107 pairs."""
+    """Return a recording of 107 stereo pairs that goes along the path and back."""
     return record_walk(tmp_path_factory.mktemp("walk") / "room", [*THERE, *THERE[-2::-1]])
 
 
 def errors_m(path: Path, world_from_map: Rigid3) -> list[float]:
-    """How far off (metres) the answers for pictures of the room are; all must be answered."""
+    """Return the position errors in metres of images of the room, all of which
+    must be localized."""
     with TopoMetricMap.load(path) as topomap:
         localizer = Localizer(topomap)
         camera, off = topomap.nodes[0].camera, []
@@ -125,7 +126,7 @@ def test_ended_early_the_map_so_far_is_whole(walk: Path, tmp_path: Path, number:
 
 @pytest.mark.slow
 def test_a_real_kitchen(shared: Path, tmp_path: Path):
-    """120 frames of 7-Scenes; the reference poses are about 3 cm off themselves."""
+    """Map 120 frames of 7-Scenes, whose reference poses are about 3 cm off themselves."""
     recording, out = shared / "data/seven_scenes/kitchen/seq-01", tmp_path / "kitchen.topo"
     assert main(["map", f"{recording}@0:120", str(out), "--piece", "60"]) == 0
     sequence = open_sequence(recording)

@@ -1,4 +1,4 @@
-"""What decides what a map looks like, as one digest."""
+"""Test the digest of a map job, which covers all inputs that decide the map."""
 
 from __future__ import annotations
 

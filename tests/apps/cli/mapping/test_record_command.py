@@ -1,4 +1,4 @@
-"""`topoloc record`: from a source to a folder that is read; signals; what is refused."""
+"""Test `topoloc record`: each source, the recorded folder, signals, and refused inputs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CONF = f"[LEFT_CAM_VGA]\n{NUMBERS}k1=-0.17\n[RIGHT_CAM_VGA]\n{NUMBERS}[STEREO]\n
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two VGA pictures side by side, the left ones of grey 10 k, the right ones 100 brighter."""
+    """Return a video of two VGA images side by side: grey 10 k, the right image 100 brighter."""
     path = tmp_path_factory.mktemp("film") / "camera.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 30.0, (1344, 376))
     for index in range(6):

@@ -1,4 +1,4 @@
-"""What a build on a cluster shows of its recordings."""
+"""Test the table of recordings that a build on a cluster prints."""
 
 from __future__ import annotations
 

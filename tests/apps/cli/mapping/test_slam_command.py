@@ -1,4 +1,4 @@
-"""`topoloc slam`, and `topoloc build` of a recording that has no poses."""
+"""Test `topoloc slam`, and `topoloc build` of a recording without poses."""
 
 from __future__ import annotations
 

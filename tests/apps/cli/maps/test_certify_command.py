@@ -1,4 +1,4 @@
-"""`topoloc certify`: what a map promises, typed as a user does."""
+"""Test `topoloc certify`: it computes, stores and draws the certificate of a map."""
 
 from __future__ import annotations
 

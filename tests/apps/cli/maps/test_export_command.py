@@ -1,5 +1,5 @@
-"""`topoloc export`: formats by name, outputs whole or not there, links followed, and what cannot be
-exported."""
+"""Test `topoloc export`: formats by file name, complete outputs or none, links, and
+refused exports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The floor of a map: found in a tilted world below a table, refused where only a table is seen."""
+"""Test the floor estimate of a map in a tilted world: the floor below a table, or a refusal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def area(rng: np.random.Generator, lower: tuple, upper: tuple, num: int, noise: 
 
 
 def place(points: np.ndarray) -> TopoMetricMap:
-    """A map of two nodes, 1.3 m above the floor, that see these points (metres, z up)."""
+    """Return a map of two nodes, 1.3 m above the floor, that see these points (metres, z up)."""
     world = TILTED.apply(points)
     poses = [
         TILTED @ Rigid3(exp_so3(np.array([0.0, 0.0, turn])) @ LEVEL_FROM_CAM, np.array([x, 0, 1.3]))

@@ -1,4 +1,4 @@
-"""`topoloc georeference`: a map learns where on earth it lies, and its results then say so."""
+"""Test `topoloc georeference`: it stores the place of a map on earth, and results get a GeoPose."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def placed(path: Path) -> Georeference:
 
 
 def off(path: Path) -> float:
-    """How far (metres) a point of the room is from where it is."""
+    """Return the error in metres of one point of the room on earth."""
     point = np.array([1.0, 3.0, 0.5])
     return float(np.linalg.norm(placed(path).geopoint(point).ecef() - TRUE.geopoint(point).ecef()))
 

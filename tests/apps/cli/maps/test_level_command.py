@@ -1,4 +1,4 @@
-"""`topoloc level`: a map gets a world with z up and the floor at z = 0; no distance changes."""
+"""Test `topoloc level`: z points up, the floor is at z = 0, and all distances stay."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def own_map(room_map: Path, tmp_path: Path) -> Path:
 
 
 def level(path: Path, *options: str) -> Rigid3:
-    """Type the command; return new_from_old."""
+    """Run the command and return new_from_old."""
     out = path.with_suffix(".json")
     assert main(["level", str(path), *options, "--json", str(out)]) == 0
     return Rigid3.from_matrix(json.loads(out.read_text())["new_from_old"])
@@ -80,7 +80,7 @@ def test_place_on_earth_stays(own_map: Path):
 
 @pytest.mark.parametrize("are_named", [True, False])
 def test_points_of_a_robots_plan(own_map: Path, tmp_path: Path, are_named: bool):
-    """The plan is turned by 30 degrees and shifted."""
+    """Align a map with a plan that is rotated by 30 degrees and shifted."""
     cosine, sine = np.cos(np.pi / 6), np.sin(np.pi / 6)
     plan = np.array([[cosine, -sine], [sine, cosine]])
     with TopoMetricMap.load(own_map) as topomap:
@@ -105,7 +105,7 @@ def test_points_with_heights_need_no_floor(own_map: Path, tmp_path: Path):
 
 
 def test_a_map_is_level_at_once(tiny_recording: Path, tmp_path: Path):
-    """The floor of this room is at z = -1.3 of the recording's world, whose z is up."""
+    """Level a map during the build. The recording's floor is at z = -1.3, and its z points up."""
     out = tmp_path / "room.topo"
     assert main(["build", str(tiny_recording), str(out), "--level"]) == 0
     sequence = open_sequence(tiny_recording)

@@ -1,4 +1,4 @@
-"""One line at the end: what the pictures of one camera say of its calibration together."""
+"""Test the last line of a query run: all images of a camera together check its calibration."""
 
 from __future__ import annotations
 

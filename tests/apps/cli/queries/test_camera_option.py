@@ -1,5 +1,4 @@
-"""--camera, --scale and --images of the commands that open recordings; pictures of several shapes
-in one list."""
+"""Test --camera, --scale and --images, and lists of images of several sizes."""
 
 from __future__ import annotations
 
@@ -50,7 +49,8 @@ def test_build_and_evaluate_by_four_numbers(
 
 
 def test_slam_by_a_file(tiny_recording: Path, tmp_path: Path):
-    """A calibration is taken at its word: with twice the baseline everything is twice as large."""
+    """A calibration file is used as it is: twice the baseline makes the trajectory
+    twice as long."""
     (tmp_path / "mine.json").write_text(json.dumps(CAMERA.to_json() | {"baseline": 0.24}))
     lengths = []
     for name, options in (("own", []), ("mine", ["--camera", str(tmp_path / "mine.json")])):
@@ -128,7 +128,7 @@ def test_what_is_refused(
 
 
 def test_a_scale_is_that_of_the_poses(tiny_recording: Path, tmp_path: Path):
-    """Of single pictures the map is as large as the poses say."""
+    """A map of single images has the scale of its poses."""
     own = tmp_path / "single"
     (own / "images").mkdir(parents=True)
     for file in sorted((tiny_recording / "image_0").iterdir()):

@@ -1,4 +1,4 @@
-"""`topoloc evaluate` where truth and map are in different worlds."""
+"""Test `topoloc evaluate` if ground truth and map use different world frames."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_rigid_fit_is_offered_written_and_read(
 
 
 def turned_half(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
-    """The quaternion (x, y, z, w) after half a turn about z: (0, 0, 1, 0) times it."""
+    """Return the quaternion (x, y, z, w) after half a turn about z: (0, 0, 1, 0) times it."""
     return (-y, x, w, -z)
 
 
@@ -81,7 +81,7 @@ def test_nothing_is_written_where_nothing_is_to_be_explained(
 def test_the_lab_of_the_zed_minutes_later(
     shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Two sessions with worlds of their own, 20 degrees apart."""
+    """The world frames of the two sessions are 20 degrees apart."""
     lab, path = shared / "data" / "zed_lab", tmp_path / "lab.topo"
     assert main(["build", f"{lab}/session1@0::4", str(path), "--features", "surf"]) == 0
     assert (

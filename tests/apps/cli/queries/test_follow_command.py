@@ -1,4 +1,4 @@
-"""topoloc follow: a line a picture, and an end when it is told to."""
+"""Test `topoloc follow`: it prints one line per image and stops on a signal."""
 
 from __future__ import annotations
 
@@ -55,8 +55,7 @@ def test_a_camera_that_runs_is_followed_until_it_ends(
 
 
 def test_it_ends_when_it_is_told_to(room_map: Path, tiny_recording: Path, tmp_path: Path):
-    """A stream that would go on for minutes: two thousand pictures, the same four again and
-    again."""
+    """The stream would last for minutes: two thousand images, the same four again and again."""
     pictures = sorted((tiny_recording / "image_0").iterdir())[:4]
     for number in range(2000):
         (tmp_path / f"{number:06d}.png").symlink_to(pictures[number % 4])

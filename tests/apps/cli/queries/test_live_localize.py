@@ -1,4 +1,4 @@
-"""topoloc localize on a camera that runs now, over HTTP from this machine."""
+"""Test `topoloc localize` on a live camera, over HTTP from this machine."""
 
 from __future__ import annotations
 

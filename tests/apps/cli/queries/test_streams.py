@@ -1,5 +1,5 @@
-"""topoloc localize on recordings and videos: states, trajectories, odometry, and streams that are
-broken."""
+"""Test `topoloc localize` on recordings and videos: states, trajectories, odometry,
+broken streams."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ STATES = {"t_ns", "state", "smoothed", "smoothed_covariance"}
 
 @pytest.fixture(scope="module")
 def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The rendered stream as a KITTI-like recording of one camera, with a video of the same; not to
-    be written to."""
+    """Return the rendered stream as a recording of one camera, with a video beside
+    it. Read-only."""
     folder = tmp_path_factory.mktemp("stream") / "walk"
     (folder / "image_0").mkdir(parents=True)
     writer = cv2.VideoWriter(

@@ -1,4 +1,4 @@
-"""Pictures without a calibration: localized all the same, with the focal length that was found."""
+"""Test images without a calibration: the result has a pose and the estimated focal length."""
 
 from __future__ import annotations
 

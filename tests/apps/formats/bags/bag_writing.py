@@ -1,5 +1,5 @@
-"""Recordings written as bags by the formats' own libraries: ROS 1 and ROS 2 by rosbags, MCAP by
-mcap's writer."""
+"""Write recordings as bags with the formats' own libraries: rosbags for ROS 1 and 2,
+mcap for MCAP."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ Write = Callable[[str, str, int, dict[str, Any]], None]
 
 
 def message(store: Any, kind: str, fields: dict[str, Any]) -> Any:
-    """A message; nested ones are dictionaries, and named as ROS 2 does (d, k, r, p)."""
+    """Return a message. Nested messages are dictionaries with the field names of ROS
+    2 (d, k, r, p)."""
     made = {}
     for name, (node, of) in store.get_msgdef(kind).fields:
         value = fields.get(name, fields.get(name.lower(), 0 if name == "seq" else None))
@@ -61,7 +62,7 @@ def message(store: Any, kind: str, fields: dict[str, Any]) -> Any:
 
 @contextmanager
 def bag_writer(path: Path, kind: str) -> Iterator[Write]:
-    """Writes a bag of this kind."""
+    """Yield a function that writes messages to a bag of this format."""
     if kind == "mcap-zstd":
         with _mcap_writer(path) as write:
             yield write
@@ -93,7 +94,8 @@ def bag_writer(path: Path, kind: str) -> Iterator[Write]:
 
 @contextmanager
 def _mcap_writer(path: Path) -> Iterator[Write]:
-    """ROS 2 messages by mcap's own writer, in chunks packed by zstd."""
+    """Yield a function that writes ROS 2 messages with mcap's own writer, in chunks
+    packed by zstd."""
     with path.open("wb") as file:
         writer = McapWriter(file, chunk_size=200_000, compression=CompressionType.ZSTD)
         writer.start(profile="ros2")
@@ -120,7 +122,7 @@ def header(t_ns: int, frame: str = "left_optical") -> dict[str, Any]:
 def image(
     pixels: np.ndarray, t_ns: int, encoding: str | None = None, frame: str = "left_optical"
 ) -> dict[str, Any]:
-    """A sensor_msgs/Image, its rows padded by three bytes."""
+    """Return a sensor_msgs/Image with three bytes of padding after each row."""
     grey = f"mono{8 * pixels.itemsize}"
     encoding = encoding or (grey if pixels.ndim == 2 else "rgb8")
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
@@ -135,7 +137,7 @@ def image(
 
 
 def compressed(pixels: np.ndarray, t_ns: int, suffix: str = ".png") -> dict[str, Any]:
-    """A sensor_msgs/CompressedImage."""
+    """Return a sensor_msgs/CompressedImage."""
     bgr = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
     return {
         "header": header(t_ns),
@@ -147,7 +149,8 @@ def compressed(pixels: np.ndarray, t_ns: int, suffix: str = ".png") -> dict[str,
 def info(
     camera: Camera, t_ns: int, baseline: float = 0.0, frame: str = "left_optical", **fields: Any
 ) -> dict[str, Any]:
-    """A sensor_msgs/CameraInfo of a pinhole; the right camera of a pair with its `baseline`."""
+    """Return a sensor_msgs/CameraInfo of a pinhole camera. `baseline` makes it the right
+    camera of a pair."""
     k = camera.matrix()
     p = np.column_stack([k, [-camera.fx * baseline, 0.0, 0.0]])
     its = {
@@ -177,7 +180,7 @@ def as_pose(pose: Rigid3) -> dict[str, Any]:
 
 
 def by_tf(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
-    """A body that moves, and a camera fixed to it."""
+    """Write the pose as TF: a moving body, and a camera fixed to it."""
     body_from_cam = Rigid3.exp(np.array([0.1, -0.2, 0.05, 0.3, 1.2, -0.4]))
     kind = "tf2_msgs/msg/TFMessage"
     write(
@@ -224,8 +227,8 @@ def write_stereo_bag(
     is_compressed: bool = False,
     factor: int = 0,
 ) -> Path:
-    """A stereo recording of rectified pairs as a bag. Its messages are written some milliseconds
-    after their own times. With a `factor` its pixels have 16 bits."""
+    """Write rectified stereo pairs as a bag. Each message is written some milliseconds after its
+    stamp. With a `factor`, pixels have 16 bits."""
     with bag_writer(path, kind) as write:
         for index in range(len(sequence)):
             frame = sequence[index]
@@ -269,8 +272,8 @@ FOXGLOVE = {
 def write_foxglove(
     path: Path, sequence: StereoSequence, classes: dict[str, Any] | None = None
 ) -> Path:
-    """The left pictures of a recording by Foxglove's schemas, as JSON, or as protobuf by the
-    message `classes`."""
+    """Write the left images of a recording with Foxglove's schemas: as JSON, or as protobuf if
+    `classes` is given."""
     with path.open("wb") as file:
         writer = McapWriter(file)
         writer.start()

@@ -1,4 +1,4 @@
-"""A stereo recording of a few frames, and what it is as a bag of each kind."""
+"""Provide a short stereo recording, and functions that write it as a bag of each format."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ SUFFIXES = {"ros1": ".bag", "ros1-lz4": ".bag", "ros2": "", "ros2-mcap": "", "mc
 
 @pytest.fixture(scope="session")
 def walk(tiny_recording: Path) -> StereoSequence:
-    """Five stereo pairs with poses."""
+    """Return five stereo pairs with poses."""
     return open_sequence(f"{tiny_recording}@0:10:2")
 
 
 @pytest.fixture
 def bag_of(walk: StereoSequence, tmp_path: Path) -> Callable[..., Path]:
-    """Writes `walk` as a bag of a kind."""
+    """Return a function that writes `walk` as a bag of a format."""
 
     def write(kind: str, **settings: object) -> Path:
         return write_stereo_bag(
@@ -34,7 +34,7 @@ def bag_of(walk: StereoSequence, tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def file_of(bag_of: Callable[..., Path]) -> Callable[[str], Path]:
-    """The one file of messages of such a bag."""
+    """Return a function that writes such a bag and returns the file that contains its messages."""
 
     def write(kind: str) -> Path:
         path = bag_of(kind)

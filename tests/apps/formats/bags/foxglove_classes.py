@@ -1,5 +1,5 @@
-"""Foxglove's protobuf schemas of pictures, calibrations and poses, as far as they are needed
-(github.com/foxglove/schemas)."""
+"""Define the fields that tests use of Foxglove's protobuf schemas for images, calibrations and
+poses (github.com/foxglove/schemas)."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ _KINDS = {"double": 1, "doubles": 1, "string": 9, "bytes": 12, "fixed32": 7}
 
 @dataclass(frozen=True)
 class MessageClass:
-    """A message type with the descriptors that a file of its messages holds."""
+    """Hold a message type and the descriptors that a file of its messages contains."""
 
     made_by: Any
     file_set: bytes
 
     def written(self, fields: dict[str, Any], t_ns: int) -> bytes:
-        """A message of these fields and this time, in bytes."""
+        """Return the bytes of a message with these fields and this time."""
         message = json_format.ParseDict(
             {key: value for key, value in fields.items() if key != "data"}, self.made_by()
         )
@@ -63,7 +63,7 @@ class MessageClass:
 
 
 def foxglove_classes() -> dict[str, MessageClass]:
-    """The message types by name, without foxglove before it."""
+    """Return the message types by name, without the prefix `foxglove.`."""
     file = descriptor_pb2.FileDescriptorProto(
         name="foxglove.proto", package="foxglove", syntax="proto3"
     )

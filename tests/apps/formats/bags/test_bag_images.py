@@ -1,4 +1,4 @@
-"""Pictures and depth of messages, by encoding."""
+"""Test the decoding of images and depth in messages, by encoding."""
 
 from __future__ import annotations
 
@@ -107,7 +107,8 @@ def test_compressed_depth_of_both_kinds():
 
 
 def encode_rvl(pixels: np.ndarray) -> bytes:
-    """As in the paper: runs of zeros and of others, differences in zigzag, 3 bits a nibble."""
+    """Encode depth as in the RVL paper: runs of zeros and non-zeros, zigzag differences, 3
+    bits per nibble."""
     nibbles: list[int] = []
 
     def add(number: int) -> None:

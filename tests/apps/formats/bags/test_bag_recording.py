@@ -1,5 +1,4 @@
-"""Bags written by the formats' own libraries are the recordings that they were made of: pictures,
-times, calibration, poses."""
+"""Check that a bag equals its source recording: images, times, calibration and poses."""
 
 from __future__ import annotations
 
@@ -131,8 +130,8 @@ def test_said_topics_override_the_guess(walk: StereoSequence, bag_of: BagOf):
 
 
 def test_pose_frame_names_the_frame_of_the_poses(walk: StereoSequence, tmp_path: Path):
-    """Poses of a body whose topic does not name it; TF's fixed part knows where the camera is on
-    it."""
+    """The topic has poses of a body but no frame name. Static TF has the camera's
+    place on the body."""
     body_from_cam = Rigid3.exp(np.array([0.1, -0.2, 0.05, 0.3, 1.2, -0.4]))
 
     def poses(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
@@ -219,7 +218,7 @@ def test_the_map_of_a_bag_is_that_of_its_recording(
 
 
 def test_depth_with_its_own_camera(tmp_path: Path):
-    """Unregistered depth in mm, whose camera TF places beside the colour camera."""
+    """Unregistered depth in mm has its own camera. TF gives its place beside the colour camera."""
     depth = np.full((48, 64), 1500, np.uint16)
     depth[0, :2] = 0, 65535
     cam_from_depth = Rigid3(np.eye(3), np.array([-0.015, 0.0, 0.0]))
@@ -351,7 +350,7 @@ def test_a_pair_needs_calibration(tmp_path: Path):
 
 
 def write_mono(path: Path, width: int, height: int, **fields: object) -> Path:
-    """A bag of one image of this size, with a calibration with these fields."""
+    """Write a bag with one image of this size and a calibration with these fields."""
     pixels = np.zeros((height, width), np.uint8)
     with bag_writer(path, "ros2") as write:
         write("/image_raw", "sensor_msgs/msg/Image", 10**18, image(pixels, 10**18))
@@ -445,7 +444,7 @@ def test_without_the_extra_it_is_named(
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2", "ros2-mcap"])
 def test_opening_reads_no_picture(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Of 48 MB of pictures the beginnings are read, and a frame reads its own two."""
+    """Of 48 MB of images, opening reads the headers. A frame reads its own two images."""
     path = tmp_path / ("big.bag" if kind == "ros1" else "big")
     camera = Camera.pinhole(2000, 1000, 900.0, 900.0, 1000.0, 500.0)
     with bag_writer(path, kind) as write:
@@ -486,7 +485,7 @@ def test_opening_reads_no_picture(kind: str, tmp_path: Path, monkeypatch: pytest
 def test_bits_in_use_are_those_of_the_whole_recording(
     walk: StereoSequence, bag_of: BagOf, factor: int, is_compressed: bool
 ):
-    """A camera of 10, 12, 14 or 16 bits, whose darkest images may use less."""
+    """The camera has 10, 12, 14 or 16 bits. Its darkest images may use fewer."""
     sequence = open_sequence(bag_of("ros2", factor=factor, is_compressed=is_compressed))
     for index in range(len(walk)):
         read, frame = sequence[index], walk[index]

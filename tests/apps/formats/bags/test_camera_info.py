@@ -1,5 +1,5 @@
-"""Calibrations of messages: which model, raw or rectified, and the pair of two of them against
-OpenCV's rectification."""
+"""Test calibrations in messages: camera models, raw or rectified images, and pairs as OpenCV
+rectifies them."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def test_rectified_pictures_are_of_p():
 
 
 def test_a_raw_pair_rectifies_as_its_calibration_says():
-    """R and P as OpenCV's stereoRectify gives them for a pair that is turned and shifted; the pair
-    is found again."""
+    """OpenCV's stereoRectify gives R and P of a rotated and shifted pair. The reader
+    recovers the pair."""
     rotation, translation = exp_so3(np.array([0.01, -0.03, 0.02])), np.array([-0.12, 0.003, -0.002])
     distortion = np.array([0.1, -0.05, 0.001, -0.001, 0.0])
     r_left, r_right, p_left, p_right, *_ = cv2.stereoRectify(

@@ -1,5 +1,5 @@
-"""Bags that were cut off are used as far as they are whole; whatever the bytes are, only errors of
-this house come out."""
+"""Check that truncated bags are read up to the damage, and that any bytes raise only
+topoloc's errors."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_command_says_that_a_bag_was_cut_off(
 
 
 def test_a_bag_that_was_never_closed(file_of: FileOf, walk: StereoSequence):
-    """As a recorder that was killed leaves it: no index, and the header says so."""
+    """A killed recorder leaves a bag without an index, which its header shows."""
     path = file_of("ros1")
     data = path.read_bytes()
     place = data.index(b"index_pos=") + len(b"index_pos=")
@@ -102,7 +102,7 @@ def test_a_topic_whose_name_is_damaged_is_not_shown(file_of: FileOf):
 
 @pytest.mark.parametrize("kind", FEATURE_TYPES)
 def test_changed_bytes_raise_errors_of_this_house_alone(kind: str, file_of: FileOf, tmp_path: Path):
-    """Bytes changed where structure is: within what is no picture, and lengths most of all."""
+    """Change bytes outside of image data, mostly in lengths."""
     path = file_of(kind)
     whole = path.read_bytes()
     rng = np.random.default_rng(3)

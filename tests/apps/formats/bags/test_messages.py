@@ -1,4 +1,4 @@
-"""Foxglove's messages as JSON and as protobuf, times of beginnings, and what is no message."""
+"""Test Foxglove's messages as JSON and protobuf, the times of chunks, and invalid messages."""
 
 from __future__ import annotations
 

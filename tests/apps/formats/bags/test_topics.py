@@ -1,4 +1,4 @@
-"""Topics guessed by the names that drivers give."""
+"""Check that topics are guessed from the names that drivers use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transforms along chains of frames, fixed and moving."""
+"""Test transforms along chains of static and moving frames."""
 
 from __future__ import annotations
 

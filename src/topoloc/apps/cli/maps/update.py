@@ -8,7 +8,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc import Atlas, AtlasConfig, LocalizerConfig, TopoMetricMap, Trajectory, open_place
+from topoloc import (
+    Atlas,
+    AtlasConfig,
+    LocalizerConfig,
+    Trajectory,
+    open_place,
+    set_look_alike_floors,
+)
 from topoloc.apps.cli.mapping.recordings_table import report_outcomes
 from topoloc.apps.cli.maps.session_update import AtlasUpdate, SessionUpdateOptions, describe_update
 from topoloc.apps.cli.output import (
@@ -78,7 +85,7 @@ class Command:
             place, value = open_place(self.paths[0]), self.look_alike_floors == "yes"
 
             def change(path: Path) -> dict[str, Any]:
-                TopoMetricMap.set_look_alike_floors(path, value, print_waiting)
+                set_look_alike_floors(path, value, print_waiting)
                 if self.json != "-":
                     print_line(f"{path.name}: floors {'' if value else 'do not '}look alike")
                 return {"look_alike_floors": value}

@@ -30,7 +30,7 @@ from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.core_names import as_monocular
 from topoloc.apps.query_camera import select_frame_camera
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
-from topoloc.apps.report.explanation_page import explanation_page, row_of, verdict
+from topoloc.apps.report.explanation_page import check_row, explanation_page, row_of, verdict
 from topoloc.plugin import write_text
 
 
@@ -106,7 +106,7 @@ def _select_tile(
 
 
 def _report(explanation: Explanation) -> Iterator[str]:
-    """Yield the result, the advice, and a line for each tried pose."""
+    """Yield the result, the advice, and a line for each tried pose and each check."""
     yield verdict(explanation)
     yield from (f"- {line}" for line in explanation.advice)
     for pose in explanation.poses:
@@ -114,3 +114,5 @@ def _report(explanation: Explanation) -> Iterator[str]:
         near, again = node and f"node {node}", found and f"found {found}"
         facts = ", ".join(filter(None, (near, f"{first} at first", again, probability)))
         yield f"  {source} ({features}): {facts}: {became}"
+    for finding in explanation.findings:
+        yield "  " + ": ".join(check_row(finding)[:2])

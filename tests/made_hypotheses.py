@@ -1,4 +1,4 @@
-"""Hypotheses made by hand, for tests of what is believed of them."""
+"""Make hypotheses by hand for tests of the belief."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def made_fit(
     features: Features | None = None,
     node_id: int = 1,
 ) -> PoseFit:
-    """A pose `x` metres along the world's x axis, on these points; row k of the features is point
-    k's."""
+    """Return a pose `x` metres along the world's x axis with these points. Row k of the
+    features is point k."""
     points_world = np.zeros((0, 3)) if points_world is None else points_world
     features = made_features(len(points_world)) if features is None else features
     count, rows = len(points_world), np.arange(len(points_world), dtype=np.int32)
@@ -69,8 +69,8 @@ def made_hypothesis(
     walls: bool = False,
     fit: PoseFit | None = None,
 ) -> Hypothesis:
-    """A hypothesis `x` metres along the world's x axis; of the walls, or of the nodes. The odds are
-    as given, whatever the evidence."""
+    """Return a hypothesis `x` metres along the world's x axis, of virtual views or of nodes. Its
+    odds are as given, whatever the evidence."""
     evidence = Evidence(
         150,
         5,
@@ -88,8 +88,8 @@ def made_hypothesis(
 
 
 def believed(hypotheses: list[Hypothesis], config: LocalizerConfig | None = None) -> Search:
-    """A search that came upon these hypotheses, in this order. Its map is not open: what is
-    believed asks it nothing."""
+    """Return a search that found these hypotheses in this order. Its map is not open, because the
+    belief does not read it."""
     query = Query(np.zeros((CAMERA.height, CAMERA.width), np.uint8), CAMERA, 1.0, FeatureConfig())
     resolved = (config or LocalizerConfig()).for_feature_type(SURF)
     not_open = object.__new__(OpenMap)

@@ -1,5 +1,5 @@
-"""Read calibrations of a camera or a stereo rig in YAML: OpenCV FileStorage, Kalibr camchain and
-ROS.
+"""Read calibrations of a camera or a stereo rig: camera.json, and YAML of OpenCV FileStorage,
+Kalibr camchain and ROS.
 
 OpenCV: `M1 D1 M2 D2 R T` as in its stereo sample, or the longer names of other programs. `R` and
 `T` may be in an extrinsics.yml beside it. They transform points from the left camera to the right
@@ -14,17 +14,73 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.camera_json import CameraCalibration
+from topoloc.json_data import Positive, decode_json
 from topoloc.recordings.ros_calibration import RosCalibration
 from topoloc.recordings.text_files import read_text
+
+FILE_NAME = "camera.json"
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """Hold a camera model, and the `rig` of a stereo pair. The camera is the left one of the pair.
+    `depth_factor` is in file units per metre. `body_from_cam` is the mounting of the camera."""
+
+    camera: Camera
+    rig: StereoRig | None = None
+    depth_factor: float | None = None
+    body_from_cam: Rigid3 | None = None
+
+
+def read_camera_json(path: Path) -> CameraCalibration:
+    """Read a camera.json.
+
+    It holds one camera, optionally with the "baseline" (metres) of a rectified stereo pair whose
+    left camera it is. Or it holds a stereo pair of any calibration: "left", "right" and
+    "right_from_left" (4x4, metres).
+
+    Raises:
+        CalibrationError: the file is missing, is not JSON, or a key is missing or out of range.
+            Names the file.
+    """
+    text = read_text(path, CalibrationError, "no such camera file")
+    whole = decode_json(text, dict[str, Any], CalibrationError, str(path))
+    data = decode_json(whole, _CameraFile, CalibrationError, str(path))
+    with CalibrationError.at(path):
+        if data.left is None and data.right is None:
+            camera = Camera.from_json(whole)
+            rig = None if data.baseline is None else StereoRig.rectified(camera, data.baseline)
+        elif data.left is None or data.right is None or data.right_from_left is None:
+            raise CalibrationError(
+                'a stereo pair has "left", "right" and "right_from_left" (4x4, metres)'
+            )
+        else:
+            camera = Camera.from_json(data.left, "left")
+            right = Camera.from_json(data.right, "right")
+            rig = StereoRig(camera, right, data.right_from_left)
+    return CameraCalibration(camera, rig, data.depth_factor)
+
+
+class _CameraFile(Struct, frozen=True):
+    """Hold the keys of a camera.json, except those of a single camera."""
+
+    depth_factor: Positive | None = None
+    baseline: Positive | None = None
+    left: dict[str, Any] | None = None
+    right: dict[str, Any] | None = None
+    right_from_left: Rigid3 | None = None
+
 
 _MAX_CHARS = 1_000_000
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
