@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.apps.robots.map_to_odom import Evidence, HealthGate
+from topoloc.apps.robots.map_to_odom import HealthGate, MeasuredPose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
@@ -115,7 +115,7 @@ def replay(
         is_measured = isinstance(answer.result, Localization) and not answer.is_repeated
         if is_measured and answer.smoothed is not None and covariance is not None:
             is_localized = answer.state == "localized"
-            evidence = Evidence(
+            evidence = MeasuredPose(
                 t_ns, answer.smoothed, covariance, odom_from_cam, travelled, is_localized
             )
             is_sure = answer.result.probability >= gate.min_probability

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
 from msgspec import structs
 
+from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
 from topoloc.localization.answer import lead
 from topoloc.localization.belief import (
     Belief,

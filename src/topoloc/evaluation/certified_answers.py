@@ -105,18 +105,18 @@ def max_share(num_wrong: int, num: int, confidence: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class WorstAnswers:
     """Hold, for each piece of one condition, the highest probability of a wrong answer, -1 if there
     is none."""
 
     worst: Float[np.ndarray, " n"]
 
     @staticmethod
-    def of(numbers: Sequence[int], wrong: Sequence[float]) -> Pieces:
+    def of(numbers: Sequence[int], wrong: Sequence[float]) -> WorstAnswers:
         """Return the pieces of images. `numbers` are those of their pieces, `wrong` the probability
         of an answer that is wrong, else -1."""
         groups = groupby(sorted(zip(numbers, wrong, strict=True)), key=lambda pair: pair[0])
-        return Pieces(np.array([max(one for _, one in group) for _, group in groups], float))
+        return WorstAnswers(np.array([max(one for _, one in group) for _, group in groups], float))
 
     def num_wrong(self, min_probability: float) -> int:
         """Return how many pieces hold a wrong answer at a threshold of the probability."""
@@ -150,7 +150,7 @@ class CertifiedAnswers:
     def facts(self, min_probability: float, confidence: float) -> CertifiedCondition:
         """Return the figures at a threshold of the probability."""
         wrong, num_pieces = self.wrong_probabilities(), len(set(self.pieces))
-        num_wrong_pieces = Pieces.of(self.pieces, wrong).num_wrong(min_probability)
+        num_wrong_pieces = WorstAnswers.of(self.pieces, wrong).num_wrong(min_probability)
         given = [one for one in self.answers if _probability(one) >= min_probability]
         return CertifiedCondition(
             self.name,
@@ -179,7 +179,7 @@ def derive_certificate(
     Images of the place and others are bounded apart, because their shares depend on the user. So
     each bound has half of the error probability.
     """
-    groups = list[Pieces]()
+    groups = list[WorstAnswers]()
     for is_of_place in (True, False):
         numbers, wrong = list[int](), list[float]()
         for row, one in enumerate(conditions):
@@ -187,7 +187,7 @@ def derive_certificate(
                 numbers += [row * 10**6 + number for number in one.pieces]
                 wrong += one.wrong_probabilities()
         if numbers:
-            groups.append(Pieces.of(numbers, wrong))
+            groups.append(WorstAnswers.of(numbers, wrong))
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(len(groups), 1)
     lowest = config.evidence.min_probability
     found = [one.find_threshold(lowest, max_wrong_share, confidence) for one in groups]

@@ -34,7 +34,7 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     unchanged_camera,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
-    Observations,
+    CameraObservations,
     fit_camera,
     fit_jointly,
     weigh_cameras,
@@ -42,7 +42,7 @@ from topoloc.geometry.joint_camera.joint_fit import (
 )
 from topoloc.geometry.pose_matches import (
     CAUCHY_SCALE,
-    Matches,
+    PointMatches,
     cells_of,
     is_non_collinear,
     refine_pose,
@@ -139,7 +139,7 @@ def _choose_camera(
     """Return the pose and the camera of the likeliest hypothesis, starting from those of a first
     fit. The first fit itself is returned if its hypothesis is the likeliest."""
     first = uncalibrated.with_focal(camera.fx)
-    seen = Observations(
+    seen = CameraObservations(
         first.normalized_from_img(finite[0]),
         config.key_point_sigma_px / camera.fx,
         finite[1],
@@ -241,7 +241,7 @@ def _refine_pose_and_focal(
     middle = math.sqrt(uncalibrated.min_focal * uncalibrated.max_focal)
     loss, worst = math.inf, (config.max_reprojection_error_px / config.key_point_sigma_px) ** 2
     for _ in range(_MAX_ROUNDS):
-        matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
+        matches = PointMatches.from_pixels(*finite, camera, config.key_point_sigma_px)
         inliers = select_inliers(cam_from_world, matches, camera, config)
         squares = np.where(inliers, squared_errors(*matches.kernel_args(cam_from_world)), worst)
         loss = float(np.log1p(squares / CAUCHY_SCALE**2).sum())

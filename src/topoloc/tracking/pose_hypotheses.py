@@ -27,8 +27,8 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
 from topoloc.node_ids import NodeId
 from topoloc.tracking.motion import (
-    Hypothesis,
     MotionConfig,
+    MotionHypothesis,
     MotionState,
     is_same_place,
     merge_duplicates,
@@ -64,9 +64,9 @@ class PoseHypotheses:
     prediction_scale: ClassVar[float] = 2.5
     """Factor on the sigma of the prediction, because hands jerk and wheels hit kerbs."""
 
-    def __init__(self, motion: MotionConfig, prior: Hypothesis | None = None) -> None:
+    def __init__(self, motion: MotionConfig, prior: MotionHypothesis | None = None) -> None:
         self.motion, self.is_track_continued = motion, False
-        self._ranked = list[Hypothesis]() if prior is None else [prior]
+        self._ranked = list[MotionHypothesis]() if prior is None else [prior]
         self._null_weight = 1.0 if prior is None else 1.0 - prior.weight
 
     @property
@@ -117,7 +117,7 @@ class PoseHypotheses:
         """
         max_seconds = 1.0  # seconds without a measured pose after which a hypothesis is dropped
         max_seconds_with_odometry = 20.0  # the same with external odometry
-        before, alive = self._ranked, list[Hypothesis]()
+        before, alive = self._ranked, list[MotionHypothesis]()
         for one in before:
             motion, limit = None, max_seconds
             if one.odom_from_cam is not None and odom_from_cam is not None:
@@ -199,7 +199,7 @@ class PoseHypotheses:
             self.miss if is_single else miss_ambiguous,
             1.0 - sum(one.probability for one in candidates),
         )
-        new, others = list[Hypothesis](), self._ranked
+        new, others = list[MotionHypothesis](), self._ranked
         if is_single:
             new, others = self._merge_consistent(candidates[0], odom_from_cam, new_evidence_ratio)
         for one in others:
@@ -221,7 +221,9 @@ class PoseHypotheses:
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance)
                 pose, node_id = Rigid3.identity(), candidate.node_id
-                new.append(Hypothesis(state, odom_from_cam, state, weight, node_id, pose, number))
+                new.append(
+                    MotionHypothesis(state, odom_from_cam, state, weight, node_id, pose, number)
+                )
         self._prune(merge_duplicates(new), self._null_weight * none**new_evidence_ratio)
         best = self.leader
         self.is_track_continued = before is not None and self.is_consistent(
@@ -237,13 +239,17 @@ class PoseHypotheses:
 
     def _merge_consistent(
         self, candidate: Candidate, odom_from_cam: Rigid3 | None, new_evidence_ratio: float
-    ) -> tuple[list[Hypothesis], list[Hypothesis]]:
+    ) -> tuple[list[MotionHypothesis], list[MotionHypothesis]]:
         """Merge the hypotheses consistent with a single pose into one. Return it, and the others.
 
         The motion is that of the likeliest of them.
         """
         pose, covariance = candidate.world_from_cam, candidate.covariance
-        weight, likeliest, others = 0.0, list[tuple[float, Hypothesis]](), list[Hypothesis]()
+        weight, likeliest, others = (
+            0.0,
+            list[tuple[float, MotionHypothesis]](),
+            list[MotionHypothesis](),
+        )
         for one in self._ranked:
             updated = self._update_with_candidate(one, 0, candidate, odom_from_cam)
             if updated is None:
@@ -263,8 +269,8 @@ class PoseHypotheses:
         return [replace(best, weight=weight)], others
 
     def _update_with_candidate(
-        self, one: Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
-    ) -> Hypothesis | None:
+        self, one: MotionHypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
+    ) -> MotionHypothesis | None:
         """Return the hypothesis updated by a candidate, weighted by its likelihood.
 
         None if the candidate is not consistent with it.
@@ -277,7 +283,7 @@ class PoseHypotheses:
         state, changes = update_motion(now, pose, covariance), {"node_id": candidate.node_id}
         return one.measured(state, odom_from_cam, weight=weight, candidate_idx=number, **changes)
 
-    def _prune(self, hypotheses: list[Hypothesis], elsewhere: float) -> None:
+    def _prune(self, hypotheses: list[MotionHypothesis], elsewhere: float) -> None:
         """Keep the hypotheses with the highest weights and normalise the weights."""
         max_number = 24  # maximum number of hypotheses, those with the highest weights
         min_weight = 0.002  # minimum weight of a hypothesis

@@ -25,8 +25,8 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     Matrix,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
+    CameraObservations,
     JointFit,
-    Observations,
     fit_camera,
     linearized_fit,
     weigh_cameras,
@@ -182,11 +182,11 @@ class _CameraEstimate:
             self._prior,
         )
 
-    def _observations(self, inliers: PointObservations) -> Observations:
+    def _observations(self, inliers: PointObservations) -> CameraObservations:
         rows = np.linspace(0, len(inliers) - 1, 256)  # their noise is the smallest error
         seen = inliers.select(np.unique(rows.astype(int)))
         points_img, camera = seen.points_img.astype(np.float64), self._reference
-        return Observations(
+        return CameraObservations(
             camera.normalized_from_img(points_img),
             self.localizer.config.pose.key_point_sigma_px / camera.fx,
             seen.points_world,

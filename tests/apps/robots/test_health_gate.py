@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from topoloc.apps.robots.map_to_odom import Evidence, HealthGate
+from topoloc.apps.robots.map_to_odom import HealthGate, MeasuredPose
 from topoloc.geometry.rigid import Rigid3
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
@@ -18,7 +18,7 @@ AWAY = Rigid3.exp(np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.1]))
 
 def _evidence(
     t_s: float, wrong: Rigid3 | None = None, is_localized: bool = True, drift: float = 0.0
-) -> Evidence:
+) -> MeasuredPose:
     """Return evidence at a time. The robot drives 0.5 m/s, and its odometry is off by
     `drift` metres."""
     way = 0.5 * t_s
@@ -26,10 +26,10 @@ def _evidence(
     truth = MAP_FROM_ODOM @ Rigid3.exp(np.array([way, 0.0, 0.3, 0.0, 0.0, 0.0]))
     pose = truth if wrong is None else wrong @ truth
     travelled = np.array([abs(way), 0.0])
-    return Evidence(round(t_s * 1e9), pose, COVARIANCE, odom_from_cam, travelled, is_localized)
+    return MeasuredPose(round(t_s * 1e9), pose, COVARIANCE, odom_from_cam, travelled, is_localized)
 
 
-def _verdicts(gate: HealthGate, evidence: Sequence[Evidence]) -> str:
+def _verdicts(gate: HealthGate, evidence: Sequence[MeasuredPose]) -> str:
     return "".join(gate.judge(one)[0] for one in evidence)
 
 
@@ -112,7 +112,7 @@ def test_a_pose_of_the_user_confirms_the_next_image(gate: HealthGate):
     prior = _evidence(1.0, AWAY)
     rough = np.diag([0.25, 0.25, 0.01, 0.01, 0.01, 0.07])
     moved = Rigid3.exp(np.array([0.3, -0.2, 0.0, 0.0, 0.0, 0.1])) @ prior.map_from_cam
-    given = Evidence(
+    given = MeasuredPose(
         prior.t_ns, moved, rough, prior.odom_from_cam, prior.travelled, is_localized=False
     )
     gate.expect(given)

@@ -21,7 +21,7 @@ Verdict = Literal["found", "jumped", "doubted"]
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class MeasuredPose:
     """Hold the pose of an image.
 
     Attributes:
@@ -66,9 +66,9 @@ class HealthGate:
 
     def __init__(self, num_confirming: int = 3) -> None:
         self._num_confirming = num_confirming
-        self.agreed: Evidence | None = None
-        self._against: list[Evidence] = []
-        self._prior: Evidence | None = None
+        self.agreed: MeasuredPose | None = None
+        self._against: list[MeasuredPose] = []
+        self._prior: MeasuredPose | None = None
 
     @property
     def is_contradicted(self) -> bool:
@@ -80,11 +80,11 @@ class HealthGate:
         self.agreed = self._prior = None
         self._against = []
 
-    def expect(self, prior: Evidence) -> None:
+    def expect(self, prior: MeasuredPose) -> None:
         """Take a pose that a user gave. The next one that agrees with it is confirmed by that."""
         self._prior = prior
 
-    def judge(self, evidence: Evidence) -> Verdict:
+    def judge(self, evidence: MeasuredPose) -> Verdict:
         """Take the pose of an image.
 
         Return "found" if it agrees with the transform, "jumped" if it is the last of several that
@@ -114,7 +114,7 @@ class HealthGate:
         seconds = standing_s if is_still else moving_s
         return last.t_ns - first.t_ns >= seconds * 1e9
 
-    def _agree(self, before: Evidence, after: Evidence) -> bool:
+    def _agree(self, before: MeasuredPose, after: MeasuredPose) -> bool:
         """Return whether two poses are the same but for the motion by odometry between them."""
         metres, radians = 0.05, 0.05  # smaller differences are none
         max_surprise = 33.0  # chi^2 of 6 degrees of freedom: 1 in 100,000

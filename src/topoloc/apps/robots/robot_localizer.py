@@ -21,9 +21,9 @@ from topoloc.apps.query_camera import CameraOfSize
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.map_to_odom import (
     ContinuityGate,
-    Evidence,
     HealthGate,
     MapToOdom,
+    MeasuredPose,
     project_to_plane,
     tilt,
 )
@@ -34,7 +34,7 @@ from topoloc.apps.robots.transform_buffer import TransformBuffer, TransformError
 
 
 @dataclass(frozen=True, eq=False)
-class Odometry:
+class OdometryPose:
     """Hold the pose of the camera in odom and on the robot at the time of an image, and the way and
     the rotation so far."""
 
@@ -72,7 +72,7 @@ class RobotLocalizer:
         self._transforms, self._gate = TransformBuffer(), HealthGate()
         self._camera_gate = ContinuityGate()  # without odometry
         self._map_to_odom, self._health = MapToOdom(), Health()
-        self._odometry: Odometry | None = None  # of the last image that had one
+        self._odometry: OdometryPose | None = None  # of the last image that had one
         self._user_pose: Any = None
         self._last_ns = self._last_stamp_ns = 0
         self._rival_at = -math.inf  # when another node published map to odom
@@ -154,7 +154,7 @@ class RobotLocalizer:
             self._clock.reset()
             self._odometry, self._last_stamp_ns = None, 0
 
-    def _find_odometry(self, t_ns: int) -> Odometry | None:
+    def _find_odometry(self, t_ns: int) -> OdometryPose | None:
         """Return the odometry at the time of an image, None if there is none."""
         config, before = self._config, self._odometry
         if not config.has_odometry:
@@ -181,10 +181,10 @@ class RobotLocalizer:
             motion = before.odom_from_cam.inverse() @ odom_from_cam
             step = np.array([np.linalg.norm(motion.translation), motion.angle()])
             travelled = before.travelled + step
-        self._odometry = Odometry(odom_from_cam, base_from_cam, travelled)
+        self._odometry = OdometryPose(odom_from_cam, base_from_cam, travelled)
         return self._odometry
 
-    def _take_prior(self, t_ns: int, odometry: Odometry) -> Uncertain | None:
+    def _take_prior(self, t_ns: int, odometry: OdometryPose) -> Uncertain | None:
         """Return world_from_cam that a user gave since the last image, if any."""
         message, self._user_pose = self._user_pose, None
         if message is None:
@@ -201,7 +201,7 @@ class RobotLocalizer:
         self._gate.expect(_make_evidence(t_ns, (pose, covariance), odometry))
         return world_from_map @ pose, world_from_map.transform_covariance(covariance)
 
-    def _publish(self, answer: StreamedPose, odometry: Odometry | None) -> None:
+    def _publish(self, answer: StreamedPose, odometry: OdometryPose | None) -> None:
         """Publish the pose of an image if it is evidence and the gate agrees."""
         health = self._health
         pose, health.probability = self._measured_pose(answer)
@@ -237,7 +237,7 @@ class RobotLocalizer:
         self._publisher.send_transform(t_ns, self._config.camera_frame, map_from_cam)
         self._publisher.send_pose(t_ns, map_from_cam, covariance)
 
-    def _judge(self, evidence: Evidence, odometry: Odometry) -> None:
+    def _judge(self, evidence: MeasuredPose, odometry: OdometryPose) -> None:
         """Ask the gate about a pose, and publish it if it agrees."""
         is_first, verdict = self._gate.agreed is None, self._gate.judge(evidence)
         if verdict == "doubted":
@@ -300,6 +300,6 @@ class RobotLocalizer:
 
 
 def _make_evidence(
-    t_ns: int, pose: Uncertain, odometry: Odometry, is_localized: bool = False
-) -> Evidence:
-    return Evidence(t_ns, *pose, odometry.odom_from_cam, odometry.travelled, is_localized)
+    t_ns: int, pose: Uncertain, odometry: OdometryPose, is_localized: bool = False
+) -> MeasuredPose:
+    return MeasuredPose(t_ns, *pose, odometry.odom_from_cam, odometry.travelled, is_localized)

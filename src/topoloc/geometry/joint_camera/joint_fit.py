@@ -39,7 +39,7 @@ _NUM_ROUNDS = 15
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class CameraObservations:
     """Hold n pixels on the plane z = 1 of a first camera (standard deviation `sigma`), and the
     world points (metres) with covariances (m^2) that they show. `cells` are parts of the image,
     within which errors may be shared."""
@@ -117,7 +117,7 @@ class JointFit:
 
 
 def fit_jointly(
-    seen: Observations,
+    seen: CameraObservations,
     cam_from_world: Rigid3,
     camera: Vector,
     prior: tuple[Vector, Matrix],
@@ -151,7 +151,7 @@ def fit_jointly(
 
 
 def fit_camera(
-    seen: Observations, cam_from_world: Rigid3, camera: Vector, prior: CameraPrior
+    seen: CameraObservations, cam_from_world: Rigid3, camera: Vector, prior: CameraPrior
 ) -> JointFit | None:
     """Fit pose and all camera parameters. Radial distortion comes first, because from far away the
     other terms lead astray. None if the observations do not fix the pose."""
@@ -163,7 +163,9 @@ def fit_camera(
     return fit_jointly(seen, fit.cam_from_world, fit.camera, prior.of(wide), wide.basis)
 
 
-def linearized_fit(seen: Observations, cam_from_world: Rigid3, camera: Vector) -> JointFit | None:
+def linearized_fit(
+    seen: CameraObservations, cam_from_world: Rigid3, camera: Vector
+) -> JointFit | None:
     """Return what the observations show of pose and camera, linearized at these. None if they do
     not fix the pose."""
     system = _linear_system(seen, cam_from_world, camera, None)
@@ -183,7 +185,7 @@ def linearized_fit(seen: Observations, cam_from_world: Rigid3, camera: Vector) -
 
 
 def _linear_system(
-    seen: Observations,
+    seen: CameraObservations,
     cam_from_world: Rigid3,
     camera: Vector,
     active: Bool[np.ndarray, " n"] | None,

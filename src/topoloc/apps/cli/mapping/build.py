@@ -15,7 +15,7 @@ from topoloc import BuildConfig, TopoMetricMap, check_map
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.mapping.map_jobs import (
     MapJob,
-    Pieces,
+    MapPieces,
     PoseOptions,
     SplitOptions,
     split_recording,
@@ -214,7 +214,7 @@ class Command:
 
         wholes = zip(derive_tile_ids(map_job.recordings), map_job.split_by_recording(), strict=True)
         pieces = [
-            Pieces([one]) if split is None else split_recording(one, name, split)
+            MapPieces([one]) if split is None else split_recording(one, name, split)
             for name, one in wholes
         ]
         names = [piece.recordings[0] for one in pieces for piece in one.piece_jobs]
