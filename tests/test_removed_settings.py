@@ -25,7 +25,7 @@ def no_warning():
 def test_the_old_defaults_are_read_in_silence():
     settings = read_settings(str(FIXTURES / "settings.toml"))
     for name in all_tables():
-        assert settings.of(config_class(name)) == config_class(name)()
+        assert settings.get(config_class(name)) == config_class(name)()
 
 
 def test_changed_keys_are_named_once(tmp_path: Path):

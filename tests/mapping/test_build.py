@@ -39,7 +39,7 @@ def depth_errors(node: TopoNode) -> np.ndarray:
 
 def test_nodes_follow_eq_1_and_every_image_belongs_to_the_nearest(tiny_map: TopoMetricMap):
     config = tiny_map.config
-    poses = NodePoses.of([summary.world_from_cam for summary in tiny_map.summaries])
+    poses = NodePoses.from_poses([summary.world_from_cam for summary in tiny_map.summaries])
     assert 2 <= len(tiny_map.nodes) <= len(tiny_map.place_images) == tiny_world.NUM_FRAMES // 2
     for image in tiny_map.place_images:
         distances = node_distances(image.world_from_cam, poses, config.lambda_rot)

@@ -178,7 +178,7 @@ def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
     chosen = sorted(select_virtual_view_nodes(poses, spaced(spacing)))
     assert chosen[0] == 0
     for k, pose in enumerate(poses):
-        distances = node_distances(pose, NodePoses.of([poses[i] for i in chosen]), 1.5)
+        distances = node_distances(pose, NodePoses.from_poses([poses[i] for i in chosen]), 1.5)
         assert distances.min() <= spacing * 0.3 + 1e-9
         if k in chosen:
             assert np.delete(distances, chosen.index(k)).min(initial=np.inf) > spacing * 0.3

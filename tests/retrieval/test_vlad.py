@@ -234,7 +234,7 @@ def test_the_stored_model_ranks_alike():
 def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig) -> float:
     """Return the share of queries with a node within 2 D_thresh (Eq. 1) among the five best."""
     topomap = build_node_map(topoloc.open_sequence(map_part), config)
-    nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    nodes = NodePoses.from_poses([summary.world_from_cam for summary in topomap.summaries])
     coarse = open_coarse_localizer(topomap.first_layer.coarse_models["surf-vlad"])
     queries = topoloc.open_sequence(query_part)
     near = []

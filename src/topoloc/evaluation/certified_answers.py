@@ -51,7 +51,7 @@ def pieces_by_pose(
     pose of a piece within five D_thresh, also if the walk comes back later."""
     firsts, numbers = list[Rigid3](), list[int]()
     for pose in poses:
-        distances = node_distances(pose, NodePoses.of(firsts), lambda_rot)
+        distances = node_distances(pose, NodePoses.from_poses(firsts), lambda_rot)
         nearest = int(np.argmin(distances)) if firsts else -1
         if not firsts or distances[nearest] > _PIECE_D_THRESH * d_thresh:
             nearest = len(firsts)
@@ -112,7 +112,7 @@ class WorstAnswers:
     worst: Float[np.ndarray, " n"]
 
     @staticmethod
-    def of(numbers: Sequence[int], wrong: Sequence[float]) -> WorstAnswers:
+    def from_numbers(numbers: Sequence[int], wrong: Sequence[float]) -> WorstAnswers:
         """Return the pieces of images. `numbers` are those of their pieces, `wrong` the probability
         of an answer that is wrong, else -1."""
         groups = groupby(sorted(zip(numbers, wrong, strict=True)), key=lambda pair: pair[0])
@@ -150,7 +150,7 @@ class CertifiedAnswers:
     def facts(self, min_probability: float, confidence: float) -> CertifiedCondition:
         """Return the figures at a threshold of the probability."""
         wrong, num_pieces = self.wrong_probabilities(), len(set(self.pieces))
-        num_wrong_pieces = WorstAnswers.of(self.pieces, wrong).num_wrong(min_probability)
+        num_wrong_pieces = WorstAnswers.from_numbers(self.pieces, wrong).num_wrong(min_probability)
         given = [one for one in self.answers if _probability(one) >= min_probability]
         return CertifiedCondition(
             self.name,
@@ -187,7 +187,7 @@ def derive_certificate(
                 numbers += [row * 10**6 + number for number in one.pieces]
                 wrong += one.wrong_probabilities()
         if numbers:
-            groups.append(WorstAnswers.of(numbers, wrong))
+            groups.append(WorstAnswers.from_numbers(numbers, wrong))
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(len(groups), 1)
     lowest = config.evidence.min_probability
     found = [one.find_threshold(lowest, max_wrong_share, confidence) for one in groups]

@@ -159,7 +159,7 @@ def _choose_camera(
         chosen = CameraHypothesis()
     mean = chosen.basis @ np.linalg.lstsq(chosen.basis, weighed[chosen][1], rcond=None)[0]
     pose = Rigid3.exp(fit.pose_by_camera @ (mean - fit.camera)) @ fit.cam_from_world
-    expected, covariance = prior.of(chosen)
+    expected, covariance = prior.moments(chosen)
     # errors of the points that the image does not show leave more to the prior
     refit = fit_jointly(seen, pose, mean, (expected, covariance / fit.variance), chosen.basis)
     if refit is None:

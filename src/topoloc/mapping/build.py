@@ -197,7 +197,7 @@ def _process_mapping_images(
         )
         for kind in config.kinds
     }
-    nodes = NodePoses.of(drafts.world_from_nodes)
+    nodes = NodePoses.from_poses(drafts.world_from_nodes)
     images, lights = list[PlaceImage](), list[Illumination]()
     vlads = {kind: DiskList[np.ndarray]() for kind in config.kinds}
     cells = {kind: [] for kind in config.kinds}

@@ -217,7 +217,7 @@ def combine_likelihoods(
     of one viewpoint share the errors of its points, so the information is scaled to the number of
     viewpoints, and to the scatter of the images beyond their noise."""
     median_chi_square = 7.344  # of eight
-    mean, covariance = prior.of(CameraHypothesis(False, "xy", "other"))
+    mean, covariance = prior.moments(CameraHypothesis(False, "xy", "other"))
     each = [one.posteriors(mean[None], covariance[None]) for one in seen]
     estimates, inverse = (
         np.stack([one[1][0] for one in each]),

@@ -101,7 +101,7 @@ class _KeyPoints:
     translations: Float[np.ndarray, "m 3"]
 
     @staticmethod
-    def of(nodes: list[TopoNode], labels: Int[np.ndarray, " m"]) -> _KeyPoints:
+    def from_nodes(nodes: list[TopoNode], labels: Int[np.ndarray, " m"]) -> _KeyPoints:
         counts = [len(node.points_cam) for node in nodes]
         poses = [node.summary.world_from_cam.inverse() for node in nodes]
         sides = np.array([max(node.camera.width, node.camera.height) for node in nodes], np.float64)
@@ -136,7 +136,7 @@ def _triangulate_tracks(
     """Fit the point of each track to its nodes' points, by their covariances, and to its key
     points."""
     nodes = [matcher.node for matcher in matchers]
-    num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.of(nodes, labels)
+    num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.from_nodes(nodes, labels)
     prior, pull = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
     covariances = np.concatenate([part.covariances for part in matchers])
     points_world = np.concatenate([part.points_world for part in matchers])

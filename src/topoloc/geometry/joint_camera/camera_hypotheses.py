@@ -98,7 +98,7 @@ class CameraPrior:
     stated: tuple[float, float]
     usual: tuple[float, float]
 
-    def of(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
+    def moments(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
         """Return mean and covariance of the parameters under a hypothesis."""
         focal = self.stated if hypothesis.is_focal_stated else self.usual
         mean, priors = unchanged_camera(), _priors()

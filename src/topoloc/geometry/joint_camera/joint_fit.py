@@ -156,11 +156,11 @@ def fit_camera(
     """Fit pose and all camera parameters. Radial distortion comes first, because from far away the
     other terms lead astray. None if the observations do not fix the pose."""
     wide = CameraHypothesis(False, "xy", "radial")
-    fit = fit_jointly(seen, cam_from_world, camera, prior.of(wide), wide.basis)
+    fit = fit_jointly(seen, cam_from_world, camera, prior.moments(wide), wide.basis)
     if fit is None:
         return None
     wide = CameraHypothesis(False, "xy", "other")
-    return fit_jointly(seen, fit.cam_from_world, fit.camera, prior.of(wide), wide.basis)
+    return fit_jointly(seen, fit.cam_from_world, fit.camera, prior.moments(wide), wide.basis)
 
 
 def linearized_fit(
@@ -233,7 +233,7 @@ def weigh_cameras(
     """Return the probability of each hypothesis, and the parameters' mean and covariance under
     it."""
     hypotheses = prior.hypotheses
-    means, covariances = map(np.array, zip(*map(prior.of, hypotheses), strict=True))
+    means, covariances = map(np.array, zip(*map(prior.moments, hypotheses), strict=True))
     evidence, estimates, posteriors = seen.posteriors(means, covariances)
     logs = evidence + [one.log_prior for one in hypotheses]
     shares = np.exp(logs - logs.max())

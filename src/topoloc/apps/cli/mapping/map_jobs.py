@@ -56,7 +56,7 @@ def parse_conventions(poses: str | None) -> tuple[PoseConventions, bool]:
     """Parse the option `--poses`, and return False if it contains `unchecked`: the poses are not
     compared with the images. Raises TrajectoryError."""
     names = (poses or "").split(",")
-    read = PoseConventions.of(",".join(name for name in names if name != "unchecked"))
+    read = PoseConventions.parse(",".join(name for name in names if name != "unchecked"))
     return read, "unchecked" not in names
 
 
@@ -209,7 +209,7 @@ class SplitOptions:
             )
 
     @staticmethod
-    def of(text: str | None) -> SplitOptions | None:
+    def parse(text: str | None) -> SplitOptions | None:
         """Parse the option, `500` or `500,50`. By default a tenth is shared. Raises UsageError."""
         if text is None:
             return None

@@ -239,4 +239,4 @@ def _run_jobs_on(
         if not isinstance(state, JobProgress):
             report_pair(state)
 
-    return lambda jobs: run_on_ray(jobs, ray, settings.of(ClusterConfig), show)
+    return lambda jobs: run_on_ray(jobs, ray, settings.get(ClusterConfig), show)

@@ -86,15 +86,15 @@ class Command:
     def run(self) -> int:
         settings = read_settings(self.config)
         localizer = open_localizer(
-            self.map, settings.of(LocalizerConfig), self.features, settings.of(AtlasConfig)
+            self.map, settings.get(LocalizerConfig), self.features, settings.get(AtlasConfig)
         )
         if self.ros or self.mavlink is not None:
             self._check_world(localizer)
         with ExitStack() as stack:
-            tracker = stack.enter_context(closing(Tracker(localizer, settings.of(TrackerConfig))))
+            tracker = stack.enter_context(closing(Tracker(localizer, settings.get(TrackerConfig))))
             stop = stack.enter_context(catch_stop_signals())
             of_size = None if self.camera is None else parse_camera(localizer, self.camera)
-            config, node, images = self._robot_config(settings.of(RobotConfig)), None, None
+            config, node, images = self._robot_config(settings.get(RobotConfig)), None, None
             if self.ros or is_topic(self.source):
                 node = stack.enter_context(closing(RosNode(config)))
             if node is not None and is_topic(self.source):
