@@ -235,7 +235,7 @@ def weigh_cameras(
     hypotheses = prior.hypotheses
     means, covariances = map(np.array, zip(*map(prior.moments, hypotheses), strict=True))
     evidence, estimates, posteriors = seen.posteriors(means, covariances)
-    logs = evidence + [one.log_prior for one in hypotheses]
+    logs = evidence + [hypothesis.log_prior for hypothesis in hypotheses]
     shares = np.exp(logs - logs.max())
     found = zip((shares / shares.sum()).tolist(), estimates, posteriors, strict=True)
     return dict(zip(hypotheses, found, strict=True))
@@ -250,8 +250,11 @@ def weigh_poses(
     by_camera = fit.pose_by_camera
     parts = [
         WeighedCamera(
-            one, share, by_camera @ (mean - reported[1]), by_camera @ covariance @ by_camera.T
+            hypothesis,
+            share,
+            by_camera @ (mean - reported[1]),
+            by_camera @ covariance @ by_camera.T,
         )
-        for one, (share, mean, covariance) in weighed.items()
+        for hypothesis, (share, mean, covariance) in weighed.items()
     ]
     return CameraBelief(reported[0], parts)

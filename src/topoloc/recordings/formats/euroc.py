@@ -94,7 +94,9 @@ def _read_sensors(
     if not has_sensors:
         folders = [folder for folder in (mav.parent, mav.parent / "dso") if folder.is_dir()]
         found = (find_calibration(folder) for folder in folders)
-        calibration = calibration or next((one for one in found if one), None)
+        calibration = calibration or next(
+            (calibration_file for calibration_file in found if calibration_file), None
+        )
     given = calibration and calibration(*first_image_size(images))
     if given is None or has_sensors:
         sensor = read_sensor(files[0])
