@@ -156,15 +156,17 @@ class MotionHypothesis:
 def merge_duplicates(hypotheses: list[MotionHypothesis]) -> list[MotionHypothesis]:
     """Merge hypotheses with the same pose and velocity, and prefer those measured now."""
     kept: list[MotionHypothesis] = []
-    least = 1e-4 * max(one.weight for one in hypotheses)
-    heavy = [one for one in hypotheses if one.weight > least]
-    for one in sorted(heavy, key=lambda one: (one.candidate_idx is None, -one.weight)):
+    least = 1e-4 * max(hypothesis.weight for hypothesis in hypotheses)
+    heavy = [hypothesis for hypothesis in hypotheses if hypothesis.weight > least]
+    for hypothesis in sorted(
+        heavy, key=lambda hypothesis: (hypothesis.candidate_idx is None, -hypothesis.weight)
+    ):
         for k, other in enumerate(kept):
-            if _is_same_motion(one.current, other.current):
-                kept[k] = replace(other, weight=other.weight + one.weight)
+            if _is_same_motion(hypothesis.current, other.current):
+                kept[k] = replace(other, weight=other.weight + hypothesis.weight)
                 break
         else:
-            kept.append(one)
+            kept.append(hypothesis)
     return kept
 
 
