@@ -42,7 +42,7 @@ from topoloc.geometry.joint_camera.joint_fit import (
 )
 from topoloc.geometry.pose_matches import (
     CAUCHY_SCALE,
-    PointMatches,
+    PoseMatches,
     cells_of,
     is_non_collinear,
     refine_pose,
@@ -245,7 +245,7 @@ def _refine_pose_and_focal(
     middle = math.sqrt(uncalibrated.min_focal * uncalibrated.max_focal)
     loss, worst = math.inf, (config.max_reprojection_error_px / config.key_point_sigma_px) ** 2
     for _ in range(_MAX_ROUNDS):
-        matches = PointMatches.from_pixels(*finite, camera, config.key_point_sigma_px)
+        matches = PoseMatches.from_pixels(*finite, camera, config.key_point_sigma_px)
         inliers = select_inliers(cam_from_world, matches, camera, config)
         squares = np.where(inliers, squared_errors(*matches.kernel_args(cam_from_world)), worst)
         loss = float(np.log1p(squares / CAUCHY_SCALE**2).sum())
