@@ -89,7 +89,7 @@ def judge(
 ) -> dict[str, Any]:
     """Top-1 and neighbour accuracy, and D_total from the query to the node named (the median, in
     D_thresh)."""
-    nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    nodes = NodePoses.from_poses([summary.world_from_cam for summary in topomap.summaries])
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
     features_config = topomap.config.features
     hits, near, away = [], [], []

@@ -19,8 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.apps.robots.config import RobotConfig
-from topoloc.apps.robots.map_to_odom import Evidence, HealthGate
+from topoloc.apps.robots.map_to_odom import HealthGate, MeasuredPose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
@@ -99,8 +98,8 @@ def replay(
     localizer: Localizer, camera: Camera, steps: list[Step], seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the errors in metres of the filter, of dead reckoning and of the published poses."""
-    odometry, config = measured_odometry(steps, seed), RobotConfig()
-    tracker, gate = Tracker(localizer), HealthGate(config)
+    odometry = measured_odometry(steps, seed)
+    tracker, gate = Tracker(localizer), HealthGate()
     filtered = Filter(steps[0].world_from_cam)
     travelled, errors, reckoned, poses = np.zeros(2), list[float](), list[float](), list[float]()
     for number, step in enumerate(steps):
@@ -109,17 +108,17 @@ def replay(
             motion = odometry[number - 1].inverse() @ odom_from_cam
             way, turn = float(np.linalg.norm(motion.translation)), motion.angle()
             travelled = travelled + np.array([way, turn])
-            filtered.predict(motion, config.odometry_error * np.repeat([way, turn], 3) + 1e-3)
+            filtered.predict(motion, gate.odometry_error * np.repeat([way, turn], 3) + 1e-3)
         picture = step.picture ^ np.uint8(number % 2)  # a dark camera has noise as well
         answer = tracker.process(picture, camera, t_ns, odom_from_cam)
         covariance = answer.smoothed_covariance
         is_measured = isinstance(answer.result, Localization) and not answer.is_repeated
         if is_measured and answer.smoothed is not None and covariance is not None:
             is_localized = answer.state == "localized"
-            evidence = Evidence(
+            evidence = MeasuredPose(
                 t_ns, answer.smoothed, covariance, odom_from_cam, travelled, is_localized
             )
-            is_sure = answer.result.probability >= config.min_probability
+            is_sure = answer.result.probability >= gate.min_probability
             if is_sure and gate.judge(evidence) != "doubted":
                 filtered.update(answer.smoothed, evidence.local_covariance)
                 poses.append(distance(answer.smoothed, step.world_from_cam))

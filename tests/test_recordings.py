@@ -13,7 +13,7 @@ from topoloc.evaluation.metrics import summarize
 from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.build import BuildConfig, build_node_map
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.recordings.frame import sequence_subset
 from topoloc.recordings.open import open_sequence
@@ -22,7 +22,7 @@ from topoloc.recordings.open import open_sequence
 @pytest.fixture(scope="module")
 def lab(shared: Path) -> Localizer:
     return Localizer(
-        build_map(
+        build_node_map(
             open_sequence(shared / "data/zed_lab/session1@0::2"),
             BuildConfig(nodes=NodeConfig(d_thresh=0.5)),
         )
@@ -47,7 +47,9 @@ def test_a_street_is_not_the_lab(lab: Localizer, shared: Path):
 
 
 def test_the_odd_frames_of_a_street_in_the_map_of_the_even_ones(shared: Path):
-    localizer = Localizer(build_map(open_sequence(shared / "data/kitti/sequences/street1@0:30:2")))
+    localizer = Localizer(
+        build_node_map(open_sequence(shared / "data/kitti/sequences/street1@0:30:2"))
+    )
     summary = summarize(
         localize_queries(localizer, open_sequence(shared / "data/kitti/sequences/street1@1:29:2"))
     )
@@ -59,7 +61,7 @@ def test_the_odd_frames_of_a_street_in_the_map_of_the_even_ones(shared: Path):
 def test_a_kitchen_by_depth_camera(shared: Path):
     kitchen = open_sequence(shared / "data/seven_scenes/kitchen")
     mapping = sequence_subset(kitchen, [i for i in range(120) if i % 20 < 12])
-    localizer = Localizer(build_map(mapping, BuildConfig(nodes=NodeConfig(d_thresh=0.5))))
+    localizer = Localizer(build_node_map(mapping, BuildConfig(nodes=NodeConfig(d_thresh=0.5))))
     summary = summarize(
         localize_queries(localizer, sequence_subset(kitchen, list(range(16, 120, 20))))
     )

@@ -25,7 +25,7 @@ def no_warning():
 def test_the_old_defaults_are_read_in_silence():
     settings = read_settings(str(FIXTURES / "settings.toml"))
     for name in all_tables():
-        assert settings.of(config_class(name)) == config_class(name)()
+        assert settings.get(config_class(name)) == config_class(name)()
 
 
 def test_changed_keys_are_named_once(tmp_path: Path):
@@ -33,10 +33,11 @@ def test_changed_keys_are_named_once(tmp_path: Path):
     path.write_text(
         "build.points.max_depth_step = 0.1\nbuild.landmarks.gate = 4\nlocalize.num_candidates = 2\n"
         "[join]\nconsensus.rival_share = 0.9\n"
+        "[robot]\nmap_frame = 'site'\nrate = 20\njump = 'smooth'\n"
     )
     with pytest.warns(UserWarning, match="no longer settings") as caught:
         read_settings(str(path))
-    named = "build.points.max_depth_step, join.consensus.rival_share"
+    named = "build.points.max_depth_step, join.consensus.rival_share, robot.jump"
     assert [str(one.message) for one in caught] == [
         f"{path}: no longer settings, without effect: {named}"
     ]

@@ -73,13 +73,11 @@ from topoloc.lifelong.weak_regions import (
     find_weak_regions as find_weak_regions,
 )
 from topoloc.localization.answer import Finding as Finding
+from topoloc.localization.config import LocalizerConfig as LocalizerConfig
 from topoloc.localization.image_calibration_check import (
     check_camera_calibrations as check_camera_calibrations,
 )
-from topoloc.localization.localizer import (
-    Localizer as Localizer,
-    LocalizerConfig as LocalizerConfig,
-)
+from topoloc.localization.localizer import Localizer as Localizer
 from topoloc.localization.map_facts.contradictions import check_map as check_map
 from topoloc.localization.map_facts.map_building import build_map as build_map
 from topoloc.localization.provenance import Provenance as Provenance
@@ -91,10 +89,7 @@ from topoloc.localization.result import (
 )
 from topoloc.localization.search import Trace as Trace, TriedProposal as TriedProposal
 from topoloc.mapping.build import BuildConfig as BuildConfig
-from topoloc.mapping.edit import (
-    read_history as read_history,
-    undo_edit as undo_edit,
-)
+from topoloc.mapping.edit import read_history as read_history, undo_edit as undo_edit
 from topoloc.mapping.georeference import (
     GeoreferenceResult as GeoreferenceResult,
     georeference as georeference,

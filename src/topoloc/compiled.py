@@ -202,7 +202,7 @@ def _cache_folders(source: str) -> list[str]:
     """Return the folders for the code of functions from the folder `source`."""
     subfolder = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     beside = os.path.join(source, "__pycache__")
-    return [beside if one is _PACKAGE else str(one / subfolder) for one in kernel_caches()]
+    return [beside if cache is _PACKAGE else str(cache / subfolder) for cache in kernel_caches()]
 
 
 @cache

@@ -21,7 +21,7 @@ from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import Tile
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.tiles.tile_joining import select_tile
+from topoloc.lifelong.tiles.tile_joining import find_best_tile
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map
@@ -240,7 +240,7 @@ def test_a_recording_is_of_the_tile_that_most_pictures_name_or_of_none(
     tiles = Atlas.open(str(own_atlas)).manifest.by_id
 
     def chosen(**counts: int) -> Tile:
-        return select_tile("walk", 12, _answers(**counts), tiles)
+        return find_best_tile("walk", 12, _answers(**counts), tiles)
 
     assert chosen(room=3).tile_id == "room"
     assert chosen(room=6, other=2).tile_id == "room"

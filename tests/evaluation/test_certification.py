@@ -15,7 +15,12 @@ from scipy.stats import binom
 from built_room import unseen_views, write_pictures
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.evaluation.certification import certify, find_nodes_in_view
-from topoloc.evaluation.certified_answers import Pieces, max_share, pieces_by_look, pieces_by_pose
+from topoloc.evaluation.certified_answers import (
+    WorstAnswers,
+    max_share,
+    pieces_by_look,
+    pieces_by_pose,
+)
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.prune import prune
 from topoloc.localization.localizer import Localizer
@@ -41,7 +46,7 @@ def test_the_bound_without_an_error_is_the_known_one():
     limit=st.floats(0.001, 0.5),
 )
 def test_the_threshold_is_the_least_that_keeps_the_limit(worst: list[float], limit: float):
-    pieces = Pieces(np.array(worst))
+    pieces = WorstAnswers(np.array(worst))
     found = pieces.find_threshold(0.5, limit, 0.95)
     limit = max(limit, max_share(0, len(worst), 0.95))
     if found is None:
@@ -58,7 +63,7 @@ def test_the_promise_holds_on_answers_that_it_did_not_see():
     for _ in range(1000):
         p = random.uniform(0.5, 1.0, 500)
         wrong = random.uniform(size=500) < 0.2 * (1.0 - p)
-        threshold = Pieces(np.where(wrong, p, -1.0)).find_threshold(0.5, 0.02, 0.95)
+        threshold = WorstAnswers(np.where(wrong, p, -1.0)).find_threshold(0.5, 0.02, 0.95)
         assert threshold is not None
         num_broken += 0.2 * (1.0 - threshold) ** 2 > 0.02  # the true share of wrong pieces
     assert num_broken <= 65

@@ -91,15 +91,16 @@ def test_units_bodies_and_combinations():
         str(number) for number in (*BODY_FROM_CAM.translation, x, y, z, w)
     )
     assert_same(
-        PoseConventions.of(text).undo_conventions((POSE @ BODY_FROM_CAM.inverse()).inverse()), POSE
+        PoseConventions.parse(text).undo_conventions((POSE @ BODY_FROM_CAM.inverse()).inverse()),
+        POSE,
     )
 
 
 def test_what_the_option_says():
-    assert PoseConventions.of("wxyz, shift=-0.25,clock=1e6") == PoseConventions(
+    assert PoseConventions.parse("wxyz, shift=-0.25,clock=1e6") == PoseConventions(
         ("wxyz",), 1e6, -0.25
     )
-    assert PoseConventions.of(None) == PoseConventions.of("") == PoseConventions()
+    assert PoseConventions.parse(None) == PoseConventions.parse("") == PoseConventions()
     assert set(ROTATIONS) | set(UNITS) | set(AXES) <= set(CONVENTION_DESCRIPTIONS)
     assert "millimetres" in describe_conventions(["opengl", "mm"])
 
@@ -120,4 +121,4 @@ def test_what_the_option_says():
 )
 def test_what_makes_no_sense_is_an_error(text: str):
     with pytest.raises(TrajectoryError):
-        PoseConventions.of(text)
+        PoseConventions.parse(text)

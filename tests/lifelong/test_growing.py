@@ -94,7 +94,7 @@ def test_existing_map_is_not_replaced(room_map: Path):
 
 def test_counts_of_one_session_add_up():
     none = np.zeros((2, 3, 3))
-    measured = LandmarkStatistics.of(
+    measured = LandmarkStatistics.from_equations(
         3, np.array([1, 4]), none + 9.0 * np.eye(3), np.ones((2, 3)), *np.array([[2, 2], [1, 2]])
     )
     expected, seen = np.array([0, 5, 5]), np.array([0, 4, 0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.scale_estimation import LocalizedStep, NoiseScale, estimate_noise_scale
+from topoloc.lifelong.scale_estimation import LocalizedStep, NoiseScale, fit_noise_scale
 from topoloc.lifelong.session_poses import align_motion_to_map
 from topoloc.localization.result import Localization
 
@@ -91,15 +91,15 @@ def _steps(own: dict[int, Rigid3], answers: dict[int, Localization | None]) -> l
 
 def test_one_wrong_answer_changes_nothing():
     steps = _steps(_motion(0.0003), _answers(SIGMA_M))
-    trust = estimate_noise_scale(steps, *FACTORS)
+    trust = fit_noise_scale(steps, *FACTORS)
     assert trust == NoiseScale(0.5, 1.0)
     steps[20] = replace(
         steps[20],
         cam_from_world=Rigid3(np.eye(3), np.array([0.4, 0.0, 0.0])) @ steps[20].cam_from_world,
     )
-    assert estimate_noise_scale(steps, *FACTORS) == trust
+    assert fit_noise_scale(steps, *FACTORS) == trust
 
 
 def test_a_single_answer_tells_nothing():
     steps = _steps(_motion(0.01), _answers(SIGMA_M))
-    assert estimate_noise_scale(steps[:1], *FACTORS) == NoiseScale()
+    assert fit_noise_scale(steps[:1], *FACTORS) == NoiseScale()

@@ -30,7 +30,7 @@ from topoloc.mapping.storage.integrity_check import find_map_damage
 
 def _counts(num_points: int, expected: int, seen: np.ndarray) -> LandmarkStatistics:
     rows = np.arange(num_points)
-    return LandmarkStatistics.of(
+    return LandmarkStatistics.from_equations(
         1,
         rows,
         np.zeros((num_points, 3, 3)),
@@ -170,7 +170,7 @@ def test_the_size_of_a_map_is_measured_behind_the_checks_of_its_file(
         database.execute("CREATE VIEW more AS SELECT * FROM node_points")
         database.commit()
     with pytest.raises(MapError, match=r"forged\.topo is damaged"):
-        _FileSize.of(path, ["surf"])
+        _FileSize.measure(path, ["surf"])
     for words in (("prune", path), ("merge", room_map, path, tmp_path / "out.topo")):
         assert "forged.topo is damaged" in complaint(*words)
 

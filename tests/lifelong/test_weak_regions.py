@@ -97,7 +97,7 @@ def test_few_landmarks_other_sessions_and_who_looks_back(room_map: Path):
         few = select_landmarks(first, np.arange(40))
         rows = np.arange(len(second.features))
         nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
-        seen = LandmarkStatistics.of(
+        seen = LandmarkStatistics.from_equations(
             1, rows, *nothing, np.full(len(rows), 3), np.where(rows % 2, 2, 0)
         )
         again = replace(second, session_statistics=[*second.session_statistics, seen])

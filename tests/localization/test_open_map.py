@@ -8,7 +8,7 @@ import pytest
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.nodes import NodePoses, node_distances, node_distances_for_any_roll
 
-NODES = NodePoses.of(
+NODES = NodePoses.from_poses(
     [Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.5, 0.0])), np.array([1.0, 0.0, 0.0]))]
 )
 

@@ -15,7 +15,7 @@ import tiny_world
 import topoloc
 from topoloc.errors import EmptyMapError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.build import BuildConfig, build_node_map
 from topoloc.mapping.node_drafts import finish_node
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.mapping.topomap import Edge, TopoMetricMap, TopoNode
@@ -39,7 +39,7 @@ def depth_errors(node: TopoNode) -> np.ndarray:
 
 def test_nodes_follow_eq_1_and_every_image_belongs_to_the_nearest(tiny_map: TopoMetricMap):
     config = tiny_map.config
-    poses = NodePoses.of([summary.world_from_cam for summary in tiny_map.summaries])
+    poses = NodePoses.from_poses([summary.world_from_cam for summary in tiny_map.summaries])
     assert 2 <= len(tiny_map.nodes) <= len(tiny_map.place_images) == tiny_world.NUM_FRAMES // 2
     for image in tiny_map.place_images:
         distances = node_distances(image.world_from_cam, poses, config.lambda_rot)
@@ -55,7 +55,7 @@ def test_a_map_whose_parts_lie_on_disk_while_it_is_made_is_the_same(
         tmp_path / "memory.topo"
     )
     monkeypatch.setattr("topoloc.disk_list.DEFAULT_MAX_BYTES", 0)
-    build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config).save(
+    build_node_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config).save(
         tmp_path / "disk.topo"
     )
     assert (tmp_path / "disk.topo").read_bytes() == (tmp_path / "memory.topo").read_bytes()
@@ -65,7 +65,7 @@ def test_points_are_right_and_refined_better_than_measured(
     tiny_recording: Path, tiny_map: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("topoloc.mapping.build.observe_draft", lambda *_: {})
-    unrefined = build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config)
+    unrefined = build_node_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config)
     errors, errors_before = (
         np.concatenate([depth_errors(node) for node in m.nodes]) for m in (tiny_map, unrefined)
     )
@@ -101,7 +101,7 @@ def test_a_node_holds_what_the_paper_says(tiny_map: TopoMetricMap):
 def test_limits_on_points_are_kept(tiny_recording: Path, monkeypatch: pytest.MonkeyPatch):
     few_points = partial(finish_node, max_points=50)
     monkeypatch.setattr("topoloc.mapping.build.finish_node", few_points)
-    few = build_map(topoloc.open_sequence(f"{tiny_recording}@0:4"), ALONE)
+    few = build_node_map(topoloc.open_sequence(f"{tiny_recording}@0:4"), ALONE)
     assert {summary.num_points for summary in few.summaries} == {50}
 
 
@@ -117,7 +117,7 @@ def test_points_of_a_lidar_are_as_exact_as_they_say(tmp_path: Path):
         coarse = cv2.resize(dots, (40, 30), interpolation=cv2.INTER_LINEAR)
         cv2.imwrite(str(file), np.rint(coarse).astype(np.uint16))
     every_image = replace(ALONE, nodes=NodeConfig(d_thresh=0.02, lambda_rot=1.0))
-    nodes = build_map(topoloc.open_sequence(folder), every_image).nodes
+    nodes = build_node_map(topoloc.open_sequence(folder), every_image).nodes
     sigmas = np.concatenate([np.linalg.norm(n.point_sqrt_covs[:, 3:], axis=1) for n in nodes])
     depths = np.concatenate([node.points_cam[:, 2] for node in nodes])
     errors = np.abs(np.concatenate([depth_errors(node) for node in nodes]))
@@ -131,19 +131,19 @@ def test_depth_pictures_without_a_known_depth(tmp_path: Path):
         cv2.imwrite(str(file), np.zeros((30, 40), np.uint16))
     for config in (ALONE, replace(ALONE, nodes=NodeConfig())):
         with pytest.raises(EmptyMapError, match=r"rgbd: no .*; depth is unknown .0. in all of"):
-            build_map(topoloc.open_sequence(folder), config)
+            build_node_map(topoloc.open_sequence(folder), config)
 
 
 def test_depth_pictures_make_a_map_too(tmp_path: Path):
     folder = tiny_world.write_depth_recording(tmp_path / "rgbd", indices=[0.0, 2.0, 4.0])
-    topomap = build_map(topoloc.open_sequence(folder), ALONE)
+    topomap = build_node_map(topoloc.open_sequence(folder), ALONE)
     errors = np.concatenate([depth_errors(node) for node in topomap.nodes])
     assert np.nanmedian(np.abs(errors)) < 0.005
 
 
 def test_two_recordings_make_one_map_without_an_edge_between_them(tiny_recording: Path):
     parts = [topoloc.open_sequence(f"{tiny_recording}@{part}") for part in ("0:4", "9:13")]
-    topomap = build_map(parts, ALONE)
+    topomap = build_node_map(parts, ALONE)
     last = topomap.place_images[3].node_id
     first = topomap.place_images[4].node_id
     assert first != last
@@ -174,7 +174,7 @@ def test_the_number_of_threads_changes_no_byte(
 
 def test_two_builds_of_a_real_recording_give_the_same_bytes(shared: Path, tmp_path: Path):
     for name in ("one", "two"):
-        build_map(topoloc.open_sequence(f"{shared}/data/zed_lab/session1@0:24:8")).save(
+        build_node_map(topoloc.open_sequence(f"{shared}/data/zed_lab/session1@0:24:8")).save(
             tmp_path / name
         )
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
@@ -182,7 +182,7 @@ def test_two_builds_of_a_real_recording_give_the_same_bytes(shared: Path, tmp_pa
 
 def test_progress_is_told(tiny_recording: Path):
     told: list[tuple[str, int, int]] = []
-    build_map(
+    build_node_map(
         topoloc.open_sequence(f"{tiny_recording}@0:3"), ALONE, lambda *step: told.append(step)
     )
     assert [step for step in told if step[0] == "images"] == [("images", k, 3) for k in (1, 2, 3)]
@@ -208,7 +208,7 @@ class CountedReads:
 
 def test_each_picture_is_read_once(tiny_recording: Path):
     recording = CountedReads(topoloc.open_sequence(f"{tiny_recording}@0:5"))
-    build_map(recording, ALONE)
+    build_node_map(recording, ALONE)
     assert recording.reads == [1] * 5
 
 
@@ -226,7 +226,7 @@ class CountedHalves(CountedReads):
 
 def test_the_right_picture_of_what_is_no_node_is_not_read(tiny_recording: Path):
     recording = CountedHalves(topoloc.open_sequence(f"{tiny_recording}@0:5"))
-    names = {node.summary.name for node in build_map(recording, ALONE).nodes}
+    names = {node.summary.name for node in build_node_map(recording, ALONE).nodes}
     assert 0 < len(names) < 5
     assert [name in names for name in recording.names] == [bool(reads) for reads in recording.reads]
     assert [
@@ -237,7 +237,7 @@ def test_the_right_picture_of_what_is_no_node_is_not_read(tiny_recording: Path):
 def test_an_unreadable_picture_is_named(own_recording: Path):
     (own_recording / "image_0" / "000003.png").write_bytes(b"\x89PNG")
     with pytest.raises(UnreadableImageError, match=r"000003\.png"):
-        build_map(topoloc.open_sequence(own_recording), ALONE)
+        build_node_map(topoloc.open_sequence(own_recording), ALONE)
 
 
 def test_nan_in_a_trajectory_is_refused(own_recording: Path):
@@ -245,13 +245,13 @@ def test_nan_in_a_trajectory_is_refused(own_recording: Path):
     lines[2] = lines[2].replace(lines[2].split()[3], "nan")
     (own_recording / "truth.tum").write_text("\n".join(lines))
     with pytest.raises(TrajectoryError, match=r"truth\.tum, line 3"):
-        build_map(topoloc.open_sequence(own_recording))
+        build_node_map(topoloc.open_sequence(own_recording))
 
 
 def test_recordings_without_poses_or_depth_are_refused(own_recording: Path):
     (own_recording / "truth.tum").rename(own_recording / "hidden.tum")
     with pytest.raises(TrajectoryError, match="no frame has a pose"):
-        build_map(topoloc.open_sequence(own_recording))
+        build_node_map(topoloc.open_sequence(own_recording))
     shutil.rmtree(own_recording / "image_1")
     with pytest.raises(RecordingError, match="single pictures only"):
         topoloc.build_map(topoloc.open_sequence(own_recording))
@@ -260,18 +260,18 @@ def test_recordings_without_poses_or_depth_are_refused(own_recording: Path):
 def test_blank_pictures_become_no_node(own_recording: Path):
     for side in ("image_0", "image_1"):
         cv2.imwrite(str(own_recording / side / "000000.png"), np.full((240, 320), 90, np.uint8))
-    topomap = build_map(topoloc.open_sequence(f"{own_recording}@0:6"), ALONE)
+    topomap = build_node_map(topoloc.open_sequence(f"{own_recording}@0:6"), ALONE)
     assert "image_0/000000.png" not in [summary.name for summary in topomap.summaries]
     assert len(topomap.place_images) == 6
     with pytest.raises(EmptyMapError):
-        build_map(topoloc.open_sequence(f"{own_recording}@0:1"), ALONE)
+        build_node_map(topoloc.open_sequence(f"{own_recording}@0:1"), ALONE)
     with pytest.raises(EmptyMapError):
-        build_map(topoloc.open_sequence(f"{own_recording}@0:1"))
+        build_node_map(topoloc.open_sequence(f"{own_recording}@0:1"))
 
 
 def test_a_pose_that_jumps_makes_a_node_of_its_own(tiny_recording: Path):
     sequence = topoloc.open_sequence(f"{tiny_recording}@0:3")
     poses = list(sequence.poses)
     poses[1] = Rigid3(np.eye(3), np.array([500.0, 0.0, 0.0]))
-    topomap = build_map(replace(sequence, poses=poses), ALONE)
+    topomap = build_node_map(replace(sequence, poses=poses), ALONE)
     assert [image.node_id for image in topomap.place_images][1] == 1

@@ -143,7 +143,7 @@ def test_every_node_of_a_map_has_sums_of_its_session(tiny_recording: Path):
 
 def _counts(session_id: int, rows: list[int], expected: int, seen: list[int]) -> LandmarkStatistics:
     num = len(rows)
-    return LandmarkStatistics.of(
+    return LandmarkStatistics.from_equations(
         session_id,
         np.array(rows),
         np.zeros((num, 3, 3)),
@@ -155,7 +155,7 @@ def _counts(session_id: int, rows: list[int], expected: int, seen: list[int]) ->
 
 def test_sessions_that_only_counted_take_the_room_of_two():
     """Sessions in other light, with few observations, stay separate from sessions with many."""
-    own = LandmarkStatistics.of(
+    own = LandmarkStatistics.from_equations(
         0,
         np.arange(3),
         np.tile(np.eye(3), (3, 1, 1)),

@@ -29,7 +29,7 @@ def moved(x: float, yaw: float = 0.0) -> Rigid3:
 
 
 def test_distance_is_translation_plus_lambda_times_angle():
-    nodes = NodePoses.of([moved(0.0), moved(3.0, 0.5)])
+    nodes = NodePoses.from_poses([moved(0.0), moved(3.0, 0.5)])
     np.testing.assert_allclose(
         node_distances(moved(1.0, 0.2), nodes, lambda_rot=2.0),
         [1.0 + 2.0 * 0.2, 2.0 + 2.0 * 0.3],
@@ -43,7 +43,7 @@ def test_angle_is_that_of_the_relative_rotation_up_to_half_a_turn():
         axis = rng.standard_normal(3)
         base = exp_so3(rng.standard_normal(3))
         turned = Rigid3(base @ exp_so3(axis / np.linalg.norm(axis) * angle), np.zeros(3))
-        distance = node_distances(turned, NodePoses.of([Rigid3(base, np.zeros(3))]), 1.0)[0]
+        distance = node_distances(turned, NodePoses.from_poses([Rigid3(base, np.zeros(3))]), 1.0)[0]
         assert distance == pytest.approx(angle, abs=1e-7)
 
 
@@ -78,7 +78,7 @@ def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(
 ):
     poses = [moved(x, yaw) for x, yaw in steps]
     frame_idx = select_node_frames(poses, d_thresh, lambda_rot)
-    nodes = NodePoses.of([poses[i] for i in frame_idx])
+    nodes = NodePoses.from_poses([poses[i] for i in frame_idx])
     rounding = (
         1.0 + 1e-12
     )  # a step of 1e-124 from where a node just is none is seen in one order of the sums and not in the other  # noqa: E501
@@ -98,7 +98,7 @@ def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(
 def test_the_nearest_nodes_are_those_of_all(
     nodes: list[tuple[float, float]], camera: tuple[float, float], count: int, lambda_rot: float
 ):
-    poses = NodePoses.of(
+    poses = NodePoses.from_poses(
         [moved(round(x, 1), round(yaw, 1)) for x, yaw in nodes]
     )  # equal ones among them
     right = np.argsort(node_distances(moved(*camera), poses, lambda_rot), kind="stable")[:count]

@@ -104,7 +104,7 @@ def test_walls_of_a_map_whose_ids_are_no_rows_are_recognised(renumbered: Path):
 
 def test_neighbours_are_named_by_their_ids(renumbered: Path):
     topomap = TopoMetricMap.load(renumbered)
-    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    poses = NodePoses.from_poses([summary.world_from_cam for summary in topomap.summaries])
     distances = node_distances(
         topomap.summaries[1].world_from_cam, poses, topomap.config.lambda_rot
     )

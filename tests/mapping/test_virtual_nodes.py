@@ -20,7 +20,7 @@ from topoloc.errors import MapError
 from topoloc.features.extraction import FeatureConfig, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.build import BuildConfig, build_node_map
 from topoloc.mapping.config import VirtualNodesConfig
 from topoloc.mapping.node_drafts import (
     collect_virtual_nodes,
@@ -155,7 +155,7 @@ def test_without_spacing_a_map_has_none(tiny_recording: Path):
     config = BuildConfig(
         nodes=NodeConfig(d_thresh=0.5, lambda_rot=1.0), sides=VirtualNodesConfig(spacing=0.0)
     )
-    topomap = build_map(replace(WalkAhead(0), num_pairs=2), config)
+    topomap = build_node_map(replace(WalkAhead(0), num_pairs=2), config)
     assert topomap.sides is None
     assert len(topomap.nodes) > 0
 
@@ -177,7 +177,7 @@ def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
     chosen = sorted(select_virtual_view_nodes(poses, spaced(spacing)))
     assert chosen[0] == 0
     for k, pose in enumerate(poses):
-        distances = node_distances(pose, NodePoses.of([poses[i] for i in chosen]), 1.5)
+        distances = node_distances(pose, NodePoses.from_poses([poses[i] for i in chosen]), 1.5)
         assert distances.min() <= spacing * 0.3 + 1e-9
         if k in chosen:
             assert np.delete(distances, chosen.index(k)).min(initial=np.inf) > spacing * 0.3
@@ -199,7 +199,7 @@ def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
 
 def test_a_narrow_lens_makes_a_map_without_sides():
     narrow = Camera.pinhole(320, 240, 600.0, 600.0, 159.5, 119.5)
-    topomap = build_map(replace(WalkAhead(0), num_pairs=2, camera=narrow))
+    topomap = build_node_map(replace(WalkAhead(0), num_pairs=2, camera=narrow))
     assert topomap.sides is None
 
 

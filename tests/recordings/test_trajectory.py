@@ -214,7 +214,7 @@ def test_clocks_that_differ_are_said_and_mended(tmp_path: Path):
     )
     with pytest.raises(TrajectoryError, match="--poses shift=5000"):
         Trajectory.read(late).match_frames(frames, late)
-    shift = PoseConventions.of("shift=5000")
+    shift = PoseConventions.parse("shift=5000")
     found = with_trajectory(recording_of(frames), late, shift).poses
     read = Trajectory.read(in_microseconds).match_frames(frames, in_microseconds)
     for of_file in (found, read):
@@ -230,7 +230,7 @@ def test_own_poses_are_read_as_told():
     sequence = SequenceView(
         recording_of([100_000_000 * k for k in range(20)]), list(range(20)), list(poses)
     )
-    read = with_pose_conventions(sequence, PoseConventions.of("mm,shift=0.2"))
+    read = with_pose_conventions(sequence, PoseConventions.parse("mm,shift=0.2"))
     assert read.poses[-2:] == [None, None]
     np.testing.assert_allclose(
         [pose.translation[0] for pose in read.poses[:-2] if pose],

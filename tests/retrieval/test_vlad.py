@@ -12,7 +12,7 @@ import tiny_world
 import topoloc
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
-from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.build import BuildConfig, build_node_map
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.recordings.frame import to_grey
 from topoloc.retrieval.coarse import CoarseLocalizer, VladConfig, open_coarse_localizer
@@ -233,8 +233,8 @@ def test_the_stored_model_ranks_alike():
 
 def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig) -> float:
     """Return the share of queries with a node within 2 D_thresh (Eq. 1) among the five best."""
-    topomap = build_map(topoloc.open_sequence(map_part), config)
-    nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    topomap = build_node_map(topoloc.open_sequence(map_part), config)
+    nodes = NodePoses.from_poses([summary.world_from_cam for summary in topomap.summaries])
     coarse = open_coarse_localizer(topomap.first_layer.coarse_models["surf-vlad"])
     queries = topoloc.open_sequence(query_part)
     near = []

@@ -9,7 +9,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.metric_points import StereoCamera
 from topoloc.slam.bundle.bundle_adjustment import PosePrior, adjust_bundle
-from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations
+from topoloc.slam.keyframes import DisparityBias, KeyFrame, KeyFrameObservations, Landmarks
 
 STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0)
 NOISE_PX = 0.2
@@ -35,7 +35,7 @@ def world(
             + rng.normal(0, NOISE_PX, (len(points), 3))
             + [0.0, 0.0, bias_px]
         )
-        seen = Observations(
+        seen = KeyFrameObservations(
             ids, measured, np.full((len(points), 3), 1.0 / NOISE_PX), np.ones(len(points), np.bool_)
         )
         wrong = Rigid3.exp(rng.normal(0, 0.02, 6)) @ pose if k else pose
@@ -128,7 +128,7 @@ def walk_around(num: int, num_new: int) -> tuple[list[KeyFrame], Landmarks, list
         measured = STEREO.project(pose.apply(points[groups].reshape(-1, 3))) + rng.normal(
             0, NOISE_PX, (len(groups) * num_new, 3)
         )
-        seen = Observations(
+        seen = KeyFrameObservations(
             ids[groups].ravel(),
             measured,
             np.full(measured.shape, 1.0 / NOISE_PX),
@@ -179,7 +179,9 @@ def test_anchors_hold_all_poses_and_a_wrong_one_bends_nothing():
 def test_what_a_long_walk_remembers_is_kept_small():
     keyframes, landmarks, _, points = world(2)
     seen = keyframes[0].observations
-    seen.append(Observations(np.array([7]), np.ones((1, 3)), np.ones((1, 3)), np.ones(1, np.bool_)))
+    seen.append(
+        KeyFrameObservations(np.array([7]), np.ones((1, 3)), np.ones((1, 3)), np.ones(1, np.bool_))
+    )
     arrays = [seen.landmark_ids, seen.measured, seen.weights, seen.active]
     assert sum(array.nbytes for array in arrays) <= 29 * len(seen.active)
     for _ in range(200):

@@ -118,7 +118,7 @@ def test_the_mounting_on_a_body_is_found():
         steps_of(POSES, 0), [pose @ BODY_FROM_CAM.inverse() for pose in POSES], T_NS
     )
     (convention,) = verdict.conventions
-    mended = PoseConventions.of(convention).undo_conventions(Rigid3.identity())
+    mended = PoseConventions.parse(convention).undo_conventions(Rigid3.identity())
     assert np.linalg.norm(mended.translation - BODY_FROM_CAM.translation) < 0.05
     assert (mended.inverse() @ BODY_FROM_CAM).angle() < np.radians(2.0)
 
@@ -126,7 +126,7 @@ def test_the_mounting_on_a_body_is_found():
 def test_a_shifted_clock_is_found():
     late = [None] * 6 + list(POSES[:-6])  # frame k has the pose that frame k - 6 had
     (convention,) = evaluate_poses(steps_of(POSES, 0), late, T_NS).conventions
-    assert PoseConventions.of(convention).shift_s == pytest.approx(0.6, abs=0.1)
+    assert PoseConventions.parse(convention).shift_s == pytest.approx(0.6, abs=0.1)
 
 
 def test_poses_of_another_place_are_not_explained():

@@ -9,12 +9,14 @@ import pytest
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.points.metric_points import StereoCamera
-from topoloc.slam.keyframes import DisparityBias, KeyFrame, Observations
+from topoloc.slam.keyframes import DisparityBias, KeyFrame, KeyFrameObservations
 from topoloc.slam.loop_closure import Link, is_reachable
 from topoloc.slam.place_matching import PlaceMatch
 
 STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0)
-NOTHING = Observations(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.bool_))
+NOTHING = KeyFrameObservations(
+    np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.bool_)
+)
 STEP, NUM, GAP = 0.3, 20, 4  # metres and frames, of which ten a second
 
 

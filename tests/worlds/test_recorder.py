@@ -12,7 +12,7 @@ from box_world import BOX_WORLD, RAINY_WORLD
 
 from topoloc.errors import CalibrationError, TopolocError
 from topoloc.geometry.camera import Camera
-from topoloc.mapping.build import build_map
+from topoloc.mapping.build import build_node_map
 from topoloc.recordings.open import open_sequence
 from topoloc_worlds.conditions import CONDITIONS
 from topoloc_worlds.recorder import RecordConfig, record
@@ -174,7 +174,7 @@ def test_a_recording_can_be_mapped(tmp_path: Path):
         tmp_path / "box",
         replace(CONFIG, camera=camera, route=route, depth=False, jpeg=90),
     )
-    topomap = build_map([open_sequence(tmp_path / "box")])
+    topomap = build_node_map([open_sequence(tmp_path / "box")])
     assert len(topomap.summaries) >= 2
     assert sum(summary.num_points for summary in topomap.summaries) > 30
 

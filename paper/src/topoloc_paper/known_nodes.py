@@ -32,7 +32,9 @@ class KnownNodes:
     """
 
     def __init__(self, topomap: TopoMetricMap) -> None:
-        self._nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        self._nodes = NodePoses.from_poses(
+            [summary.world_from_cam for summary in topomap.summaries]
+        )
         self._lambda_rot = topomap.config.lambda_rot
         self.world_from_cam: Rigid3 | None = None
 

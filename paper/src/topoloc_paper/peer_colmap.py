@@ -114,7 +114,7 @@ class Colmap:
         for row in rows:
             names.setdefault(row["node"], []).append(row["name"])
         poses = [self._topomap.summaries[node_id].world_from_cam for node_id in self._kept]
-        stacked, lambda_rot = NodePoses.of(poses), self._topomap.config.lambda_rot
+        stacked, lambda_rot = NodePoses.from_poses(poses), self._topomap.config.lambda_rot
         pairs = [(both[0], both[1]) for both in names.values() if len(both) == 2]
         for node_id, pose in zip(self._kept, poses, strict=True):
             nearest = np.argsort(node_distances(pose, stacked, lambda_rot), kind="stable")[

@@ -85,7 +85,7 @@ def _same_places(bench: Bench, dataset: Dataset) -> list[list[np.ndarray]]:
     found = []
     for sequence in sequences:
         poses = [pose if pose is not None else Rigid3.identity() for pose in sequence.poses]
-        stacked = NodePoses.of(poses)
+        stacked = NodePoses.from_poses(poses)
         found.append(
             [
                 sequence[int(np.argmin(node_distances(anchor, stacked, 10.0)))].image

@@ -29,9 +29,8 @@ def robot_config(parameters: Mapping[str, Any]) -> RobotConfig:
     for name, value in parameters.items():
         if name not in (*setting_names(), "use_sim_time"):
             raise ConfigError(f"parameter {name}: topoloc_ros has no such parameter")
-        is_whole = type(value) is int and isinstance(getattr(config, name), float)
         with ConfigError.at(f"parameter {name}"):
-            config = with_setting(config, name, float(value) if is_whole else value)
+            config = with_setting(config, name, value)
     return config
 
 

@@ -22,7 +22,7 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.geodesy import GeoPoint
 from topoloc.geometry.rigid import Rigid3, inverse_covariance, skew
 from topoloc.json_data import Count, Finite, encode_json
-from topoloc.slam.pose_graph import Edge, compute_normalized_residuals, optimize_pose_graph
+from topoloc.slam.pose_graph import PoseGraphEdge, compute_normalized_residuals, optimize_pose_graph
 
 if TYPE_CHECKING:
     from topoloc.atlas.manifest import Tile
@@ -303,8 +303,8 @@ def _optimize_worlds(
     return places
 
 
-def _edge(join: Join, worlds: Mapping[str, str], rows: Mapping[str, int]) -> Edge:
-    return Edge(
+def _edge(join: Join, worlds: Mapping[str, str], rows: Mapping[str, int]) -> PoseGraphEdge:
+    return PoseGraphEdge(
         rows[worlds[join.second]],
         rows[worlds[join.first]],
         join.first_from_second,

@@ -52,9 +52,9 @@ class Certification(OneLine):
         """Return one pose (world_from_cam) of each piece of the walks of which no image was
         localized."""
         found = list[Rigid3]()
-        for one in self.conditions:
-            if one.kind == "walk" and one.has_truth:
-                pairs = list(zip(one.pieces, one.answers, strict=True))
+        for condition in self.conditions:
+            if condition.kind == "walk" and condition.has_truth:
+                pairs = list(zip(condition.pieces, condition.answers, strict=True))
                 seen = {piece for piece, answer in pairs if answer.result.localized}
                 poses = {piece: answer.world_from_cam for piece, answer in pairs}
                 found += [pose for piece, pose in poses.items() if piece not in seen and pose]
@@ -67,9 +67,9 @@ class Certification(OneLine):
             "promise": self.certificate.promise(),
             "blind_spots": [pose.to_json() for pose in self.blind_spots],
             "answers": [
-                answer.to_json() | {"condition": one.name, "piece": piece}
-                for one in self.conditions
-                for piece, answer in zip(one.pieces, one.answers, strict=True)
+                answer.to_json() | {"condition": condition.name, "piece": piece}
+                for condition in self.conditions
+                for piece, answer in zip(condition.pieces, condition.answers, strict=True)
             ],
         }
 
@@ -109,10 +109,10 @@ def certify(
             *_localize_walks(localizer, walks, map_from_truth, progress),
             *_localize_beside_map(localizer, walks, map_from_truth, progress),
         ]
-        for one in out_of_map:
-            answers = localize_out_of_map(localizer, one, progress)
+        for recording in out_of_map:
+            answers = localize_out_of_map(localizer, recording, progress)
             pieces = find_pieces(topomap.config, answers, False)
-            conditions.append(CertifiedAnswers(one.name, "out_of_map", True, answers, pieces))
+            conditions.append(CertifiedAnswers(recording.name, "out_of_map", True, answers, pieces))
     certificate = derive_certificate(conditions, config, max_wrong_share, is_applied)
     with edit_map(path, on_wait) as edit:
         file = edit.topomap.file
@@ -136,7 +136,7 @@ def _localize_walks(
             answers = localize_queries(localizer, walk, map_from_truth, progress)
         else:
             answers = localize_out_of_map(localizer, walk, progress)
-        if not any(one.result.localized for one in answers):
+        if not any(answer.result.localized for answer in answers):
             raise TrajectoryError(
                 f"{walk.name}: none of {len(answers)} images is localized. If it is of another"
                 " place, give it by --out-of-map; else the map does not show it: topoloc update"
@@ -164,13 +164,19 @@ def _localize_beside_map(
     of_walks = [_HiddenImage.of_frame(walk, i, map_from_truth) for walk, i in sampled]
     for name, images in (("map", of_map), ("walks", of_walks)):
         answers, label = list[EvaluatedQuery](), f"{name}, surroundings removed"
-        for done, one in enumerate(images):
-            hidden = find_nodes_in_view(localizer.topomap, one.world_from_cam, one.camera)
+        for done, hidden_image in enumerate(images):
+            hidden = find_nodes_in_view(
+                localizer.topomap, hidden_image.world_from_cam, hidden_image.camera
+            )
             if len(hidden) < len(localizer.topomap.summaries):
-                result, _ = localizer.without(hidden).localize_query(one.read())
+                result, _ = localizer.without(hidden).localize_query(hidden_image.read())
                 answers.append(
                     EvaluatedQuery(
-                        one.name, result, one.world_from_cam, recording=label, camera=one.camera
+                        hidden_image.name,
+                        result,
+                        hidden_image.world_from_cam,
+                        recording=label,
+                        camera=hidden_image.camera,
                     )
                 )
             if progress is not None:
@@ -195,7 +201,7 @@ class _HiddenImage:
         node = topomap.nodes[row]
 
         def read() -> QueryImage:
-            features = {kind: one.nodes[row].features for kind, one in topomap.layers.items()}
+            features = {kind: layer.nodes[row].features for kind, layer in topomap.layers.items()}
             return QueryImage.of_features(features, node.camera)
 
         return _HiddenImage(node.summary.name, node.summary.world_from_cam, node.camera, read)

@@ -51,7 +51,7 @@ def pieces_by_pose(
     pose of a piece within five D_thresh, also if the walk comes back later."""
     firsts, numbers = list[Rigid3](), list[int]()
     for pose in poses:
-        distances = node_distances(pose, NodePoses.of(firsts), lambda_rot)
+        distances = node_distances(pose, NodePoses.from_poses(firsts), lambda_rot)
         nearest = int(np.argmin(distances)) if firsts else -1
         if not firsts or distances[nearest] > _PIECE_D_THRESH * d_thresh:
             nearest = len(firsts)
@@ -105,18 +105,20 @@ def max_share(num_wrong: int, num: int, confidence: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class WorstAnswers:
     """Hold, for each piece of one condition, the highest probability of a wrong answer, -1 if there
     is none."""
 
     worst: Float[np.ndarray, " n"]
 
     @staticmethod
-    def of(numbers: Sequence[int], wrong: Sequence[float]) -> Pieces:
+    def from_numbers(numbers: Sequence[int], wrong: Sequence[float]) -> WorstAnswers:
         """Return the pieces of images. `numbers` are those of their pieces, `wrong` the probability
         of an answer that is wrong, else -1."""
         groups = groupby(sorted(zip(numbers, wrong, strict=True)), key=lambda pair: pair[0])
-        return Pieces(np.array([max(one for _, one in group) for _, group in groups], float))
+        return WorstAnswers(
+            np.array([max(probability for _, probability in group) for _, group in groups], float)
+        )
 
     def num_wrong(self, min_probability: float) -> int:
         """Return how many pieces hold a wrong answer at a threshold of the probability."""
@@ -145,13 +147,13 @@ class CertifiedAnswers:
 
     def wrong_probabilities(self) -> list[float]:
         """Return the probability of each wrong answer, -1 for each other image."""
-        return [_probability(one) if is_wrong(one) else -1.0 for one in self.answers]
+        return [_probability(answer) if is_wrong(answer) else -1.0 for answer in self.answers]
 
     def facts(self, min_probability: float, confidence: float) -> CertifiedCondition:
         """Return the figures at a threshold of the probability."""
         wrong, num_pieces = self.wrong_probabilities(), len(set(self.pieces))
-        num_wrong_pieces = Pieces.of(self.pieces, wrong).num_wrong(min_probability)
-        given = [one for one in self.answers if _probability(one) >= min_probability]
+        num_wrong_pieces = WorstAnswers.from_numbers(self.pieces, wrong).num_wrong(min_probability)
+        given = [answer for answer in self.answers if _probability(answer) >= min_probability]
         return CertifiedCondition(
             self.name,
             self.kind,
@@ -159,12 +161,16 @@ class CertifiedAnswers:
             len(self.answers),
             num_pieces,
             len(given),
-            sum(one >= min_probability for one in wrong) if self.has_truth else 0,
+            sum(probability >= min_probability for probability in wrong) if self.has_truth else 0,
             num_wrong_pieces if self.has_truth else 0,
             max_share(num_wrong_pieces, num_pieces, confidence) if self.has_truth else None,
-            sum(one.is_inside_ellipsoid for one in given if self.has_truth and not is_wrong(one)),
+            sum(
+                answer.is_inside_ellipsoid
+                for answer in given
+                if self.has_truth and not is_wrong(answer)
+            ),
             _median_ms(given),
-            _median_ms([one for one in self.answers if not one.result.localized]),
+            _median_ms([answer for answer in self.answers if not answer.result.localized]),
         )
 
 
@@ -179,30 +185,32 @@ def derive_certificate(
     Images of the place and others are bounded apart, because their shares depend on the user. So
     each bound has half of the error probability.
     """
-    groups = list[Pieces]()
+    groups = list[WorstAnswers]()
     for is_of_place in (True, False):
         numbers, wrong = list[int](), list[float]()
-        for row, one in enumerate(conditions):
-            if one.has_truth and (one.kind == "walk") == is_of_place:
-                numbers += [row * 10**6 + number for number in one.pieces]
-                wrong += one.wrong_probabilities()
+        for row, condition in enumerate(conditions):
+            if condition.has_truth and (condition.kind == "walk") == is_of_place:
+                numbers += [row * 10**6 + number for number in condition.pieces]
+                wrong += condition.wrong_probabilities()
         if numbers:
-            groups.append(Pieces.of(numbers, wrong))
+            groups.append(WorstAnswers.from_numbers(numbers, wrong))
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(len(groups), 1)
     lowest = config.evidence.min_probability
-    found = [one.find_threshold(lowest, max_wrong_share, confidence) for one in groups]
-    known = [one for one in found if one is not None]
+    found = [group.find_threshold(lowest, max_wrong_share, confidence) for group in groups]
+    known = [level for level in found if level is not None]
     threshold = max([lowest, *known]) if len(known) == len(found) else None
     level = lowest if threshold is None else threshold
-    bounds = [max_share(one.num_wrong(level), len(one.worst), confidence) for one in groups]
+    bounds = [max_share(group.num_wrong(level), len(group.worst), confidence) for group in groups]
     right = [
         _probability(answer)
-        for one in conditions
-        if one.has_truth
-        for answer in one.answers
+        for condition in conditions
+        if condition.has_truth
+        for answer in condition.answers
         if answer.result.localized and not is_wrong(answer)
     ]
-    cameras = [one.camera for condition in conditions for one in condition.answers if one.camera]
+    cameras = [
+        answer.camera for condition in conditions for answer in condition.answers if answer.camera
+    ]
     settings, default = encode_json(config), encode_json(LocalizerConfig())
     return Certificate(
         map_version=0,
@@ -219,7 +227,7 @@ def derive_certificate(
         min_probability=threshold,
         lost_share=float(np.mean(np.array(right) < level)) if right else 0.0,
         is_applied=is_applied,
-        conditions=[one.facts(level, confidence) for one in conditions],
+        conditions=[condition.facts(level, confidence) for condition in conditions],
     )
 
 
@@ -233,11 +241,11 @@ def is_wrong(answer: EvaluatedQuery) -> bool:
 
 def find_pieces(config: MapConfig, answers: Sequence[EvaluatedQuery], by_pose: bool) -> list[int]:
     """Return the number of the independent piece of each image."""
-    poses = [one.world_from_cam for one in answers if one.world_from_cam is not None]
+    poses = [answer.world_from_cam for answer in answers if answer.world_from_cam is not None]
     if by_pose and len(poses) == len(answers):
         return pieces_by_pose(poses, config.d_thresh, config.lambda_rot).tolist()
-    read = [one.read_image for one in answers]
-    looks = [thumbnail(to_grey(one())) for one in read if one is not None]
+    read = [answer.read_image for answer in answers]
+    looks = [thumbnail(to_grey(read_image())) for read_image in read if read_image is not None]
     return pieces_by_look(np.array(looks)).tolist()
 
 
@@ -247,5 +255,5 @@ def _probability(answer: EvaluatedQuery) -> float:
 
 
 def _median_ms(answers: Sequence[EvaluatedQuery]) -> float | None:
-    times = [one.result.times_ms["total"] for one in answers]
+    times = [answer.result.times_ms["total"] for answer in answers]
     return float(np.median(times)) if times else None

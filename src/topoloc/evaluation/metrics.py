@@ -232,7 +232,9 @@ def fit_worlds(answers: Sequence[EvaluatedQuery]) -> WorldFit | None:
     if before < min_error:
         return None
     proposals = [found @ true.inverse() for found, true in pairs]
-    best, median = find_least_median(proposals, lambda one: _normalized_errors(one, pairs))
+    best, median = find_least_median(
+        proposals, lambda transform: _normalized_errors(transform, pairs)
+    )
     agreeing = [
         pair
         for pair, error in zip(pairs, _normalized_errors(best, pairs), strict=True)

@@ -184,7 +184,7 @@ walls seen from both directions. No map is made of them."""
 def register_feature_type(kind: FeatureType) -> None:
     """Add a feature type to those that maps may have, in this process. A map of it is opened after
     its registration only. Raises FeatureTypeError if topoloc has features of this name."""
-    if kind.name in (SURF.name, SIFT.name, *(one.name for one in LEARNED_TYPES)):
+    if kind.name in (SURF.name, SIFT.name, *(learned.name for learned in LEARNED_TYPES)):
         raise FeatureTypeError(f"features {kind.name!r} are topoloc's; give yours another name")
     FEATURE_TYPES[kind.name] = kind
 

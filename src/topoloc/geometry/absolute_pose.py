@@ -23,7 +23,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.pose_matches import (
     MIN_POINTS,
-    Matches,
+    PoseMatches,
     estimate_pose_covariance,
     is_non_collinear,
     refine_pose,
@@ -117,7 +117,7 @@ def estimate_absolute_pose(
         order = order[np.argsort(-priorities[order], kind="stable")]
     covariances = np.zeros((0, 3, 3)) if point_covariances is None else point_covariances[order]
     pixels, sigma_px = points_img[order], config.key_point_sigma_px
-    matches = Matches.from_pixels(
+    matches = PoseMatches.from_pixels(
         pixels, points_world[order], covariances, camera, sigma_px, normalized[order]
     )
     if not is_non_collinear(matches.points_world) or not is_non_collinear(
@@ -158,7 +158,7 @@ def refine_absolute_pose(
     """
     normalized = camera.normalized_from_img(points_img)
     rows = np.flatnonzero(np.isfinite(normalized).all(axis=1))
-    matches = Matches.from_pixels(
+    matches = PoseMatches.from_pixels(
         points_img[rows],
         points_world[rows],
         point_covariances[rows],
@@ -220,7 +220,7 @@ def estimate_pose_ransac(
 
 
 def _refine_on_inliers(
-    cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig
+    cam_from_world: Rigid3, matches: PoseMatches, camera: Camera, config: AbsolutePoseConfig
 ) -> Rigid3 | None:
     for _ in range(2):  # the second pass uses the inliers of the first
         inliers = select_inliers(cam_from_world, matches, camera, config)
@@ -260,7 +260,7 @@ def _solve_with_opencv(
 
 def _with_covariance(
     cam_from_world: Rigid3,
-    matches: Matches,
+    matches: PoseMatches,
     active: Bool[np.ndarray, " m"],
     order: np.ndarray,
     num_points: int,
@@ -275,7 +275,7 @@ def _with_covariance(
 
 
 def select_inliers(
-    cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig
+    cam_from_world: Rigid3, matches: PoseMatches, camera: Camera, config: AbsolutePoseConfig
 ) -> Bool[np.ndarray, " n"]:
     """Return the inliers of a pose. With poselib the threshold is widened for uncertain points."""
     errors_px = _reprojection_errors(cam_from_world, matches, camera)
@@ -291,7 +291,7 @@ def select_inliers(
 
 
 def _reprojection_errors(
-    cam_from_world: Rigid3, matches: Matches, camera: Camera
+    cam_from_world: Rigid3, matches: PoseMatches, camera: Camera
 ) -> Float[np.ndarray, " n"]:
     """Return the errors in pixels: NaN, which is below no limit, for points behind the camera or
     outside its field."""

@@ -34,7 +34,7 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     unchanged_camera,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
-    Observations,
+    CameraObservations,
     fit_camera,
     fit_jointly,
     weigh_cameras,
@@ -42,7 +42,7 @@ from topoloc.geometry.joint_camera.joint_fit import (
 )
 from topoloc.geometry.pose_matches import (
     CAUCHY_SCALE,
-    Matches,
+    PoseMatches,
     cells_of,
     is_non_collinear,
     refine_pose,
@@ -104,7 +104,7 @@ def estimate_pose_and_focal(
     for focals in (stated, usual):
         starts = [start] if start else _search_focal_lengths(finite, focals, config)
         refined = [_refine_pose_and_focal(each, finite, focals, config) for each in starts]
-        best = min(filter(None, [best, *refined]), key=lambda one: one[0], default=None)
+        best = min(filter(None, [best, *refined]), key=lambda fit: fit[0], default=None)
         # The stated focal length is that of the whole image. At a bound it is contradicted.
         is_inside = best is not None and stated.min_focal < best[2].fx < stated.max_focal
         if start or is_inside or stated == usual:
@@ -139,7 +139,7 @@ def _choose_camera(
     """Return the pose and the camera of the likeliest hypothesis, starting from those of a first
     fit. The first fit itself is returned if its hypothesis is the likeliest."""
     first = uncalibrated.with_focal(camera.fx)
-    seen = Observations(
+    seen = CameraObservations(
         first.normalized_from_img(finite[0]),
         config.key_point_sigma_px / camera.fx,
         finite[1],
@@ -153,13 +153,13 @@ def _choose_camera(
         return None
     fit = replace(fit, variance=fit.variance * map_variance(correlated_error_share))
     weighed = weigh_cameras(fit.likelihood, prior)
-    allowed = [one for one in weighed if one.lens != "other"]
-    chosen = max(allowed, key=lambda one: weighed[one][0])
-    if max(weighed, key=lambda one: weighed[one][0]).lens == "other":
+    allowed = [hypothesis for hypothesis in weighed if hypothesis.lens != "other"]
+    chosen = max(allowed, key=lambda hypothesis: weighed[hypothesis][0])
+    if max(weighed, key=lambda hypothesis: weighed[hypothesis][0]).lens == "other":
         chosen = CameraHypothesis()
     mean = chosen.basis @ np.linalg.lstsq(chosen.basis, weighed[chosen][1], rcond=None)[0]
     pose = Rigid3.exp(fit.pose_by_camera @ (mean - fit.camera)) @ fit.cam_from_world
-    expected, covariance = prior.of(chosen)
+    expected, covariance = prior.moments(chosen)
     # errors of the points that the image does not show leave more to the prior
     refit = fit_jointly(seen, pose, mean, (expected, covariance / fit.variance), chosen.basis)
     if refit is None:
@@ -171,7 +171,9 @@ def _choose_camera(
 def camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:
     """Return the prior of a camera relative to one with this focal length."""
     usual = UncalibratedCamera.unknown(uncalibrated.width, uncalibrated.height)
-    low, high = (math.log(one / focal) for one in (uncalibrated.min_focal, uncalibrated.max_focal))
+    low, high = (
+        math.log(bound / focal) for bound in (uncalibrated.min_focal, uncalibrated.max_focal)
+    )
     widest = math.log(math.sqrt(usual.min_focal * usual.max_focal) / focal), _LOG_FOCAL_SIGMA
     is_narrow = high - low < 0.999 * math.log(usual.max_focal / usual.min_focal)
     stated = ((low + high) / 2.0, (high - low) / 4.0) if is_narrow else widest
@@ -195,7 +197,7 @@ def with_parameters(camera: Camera, parameters: Vector) -> Camera:
     cx, cy = camera.cx + camera.fx * parameters[1], camera.cy + camera.fx * parameters[2]
     if parameters[3] == 0.0:
         return Camera.pinhole(camera.width, camera.height, focal, focal, cx, cy)
-    values = tuple(float(one) for one in (focal, cx, cy, parameters[3], parameters[7]))
+    values = tuple(float(value) for value in (focal, cx, cy, parameters[3], parameters[7]))
     return Camera("RADIAL", camera.width, camera.height, values)
 
 
@@ -209,7 +211,9 @@ def _search_focal_lengths(
     most = _MIN_INLIERS - 1
     ratio = uncalibrated.max_focal / uncalibrated.min_focal
     num_steps = max(1, math.ceil(math.log(ratio) / math.log(_FOCAL_STEP)))
-    exponents = sorted((np.arange(num_steps) + 0.5) / num_steps, key=lambda one: abs(one - 0.5))
+    exponents = sorted(
+        (np.arange(num_steps) + 0.5) / num_steps, key=lambda exponent: abs(exponent - 0.5)
+    )
     for k, exponent in enumerate(exponents if len(points_img) >= _MIN_INLIERS else ()):
         camera = uncalibrated.with_focal(uncalibrated.min_focal * ratio ** float(exponent))
         # After this many samples of three, one contains only right matches with a confidence of
@@ -225,7 +229,7 @@ def _search_focal_lengths(
             found.append((loss, cam_from_world, camera))
             most = max(most, num_inliers)
     # Distant and flat scenes give similar inlier counts at all focal lengths, but not errors.
-    found.sort(key=lambda one: one[0])
+    found.sort(key=lambda pose: pose[0])
     return [(cam_from_world, camera) for _, cam_from_world, camera in found[:_MAX_STARTS]]
 
 
@@ -241,7 +245,7 @@ def _refine_pose_and_focal(
     middle = math.sqrt(uncalibrated.min_focal * uncalibrated.max_focal)
     loss, worst = math.inf, (config.max_reprojection_error_px / config.key_point_sigma_px) ** 2
     for _ in range(_MAX_ROUNDS):
-        matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
+        matches = PoseMatches.from_pixels(*finite, camera, config.key_point_sigma_px)
         inliers = select_inliers(cam_from_world, matches, camera, config)
         squares = np.where(inliers, squared_errors(*matches.kernel_args(cam_from_world)), worst)
         loss = float(np.log1p(squares / CAUCHY_SCALE**2).sum())

@@ -152,7 +152,7 @@ def score_outer_products(
 
 
 @kernel()
-def refine(
+def run_gauss_newton(
     rotation, translation, normalized, covariances, points_world, point_covariances,
     active, cauchy_scale, max_steps,
 ):  # fmt: skip

@@ -234,14 +234,14 @@ def check_calibration_consistency(
 ) -> CalibrationConsistency | None:
     """Return the intrinsics estimated from images of one camera. Return None if there are fewer
     than five images or fewer than four places."""
-    if len(observations) < MIN_IMAGES or len({one.place for one in observations}) < MIN_PLACES:
+    if len(observations) < MIN_IMAGES or len({image.place for image in observations}) < MIN_PLACES:
         return None
     deviation, covariance = _robust_mean(observations)
     sigmas = np.sqrt(np.diag(covariance))
     shares = np.abs(deviation) * np.array([1.0, *np.repeat(calibrated.fx / calibrated.width, 2)])
     is_off = (np.abs(deviation) > _NUM_SIGMAS * sigmas) & (shares > _MIN_RELATIVE_DEVIATION)
     min_distorted_share = 0.3  # of 202 images through their own lens none showed another
-    distorted_share = np.mean([one.is_distorted for one in observations])
+    distorted_share = np.mean([image.is_distorted for image in observations])
     focal = calibrated.fx * float(np.exp(deviation[0]))
     centre = np.array([calibrated.cx, calibrated.cy])
     return CalibrationConsistency(
@@ -262,8 +262,8 @@ def _robust_mean(
     observations: Sequence[IntrinsicsDeviation],
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
     """Return the robust mean of the deviations and its covariance."""
-    deviations = np.stack([one.deviation for one in observations])
-    covariances = np.stack([one.covariance for one in observations])
+    deviations = np.stack([image.deviation for image in observations])
+    covariances = np.stack([image.covariance for image in observations])
     variances = np.einsum("nii->ni", covariances)
     mean = np.median(deviations, axis=0)
     information = np.eye(3)
@@ -276,5 +276,5 @@ def _robust_mean(
         inverse /= (1.0 + squares / _CAUCHY_SCALE**2)[:, None, None]
         information = inverse.sum(axis=0)
         mean = np.linalg.solve(information, np.einsum("nij,nj->i", inverse, deviations))
-    num_places = len({one.place for one in observations})
+    num_places = len({image.place for image in observations})
     return mean, np.linalg.inv(information) * len(observations) / num_places

@@ -90,7 +90,7 @@ class GeoPoint:
 
 
 @dataclass(frozen=True)
-class Quaternion:
+class UnitQuaternion:
     """Hold a unit quaternion. Raises ValueError if its length is not 1 within 0.001."""
 
     x: float
@@ -112,7 +112,7 @@ class GeoPose(OneLine):
     """
 
     position: GeoPoint
-    quaternion: Quaternion
+    quaternion: UnitQuaternion
 
     @property
     def quat_wxyz(self) -> Float[np.ndarray, "4"]:
@@ -170,7 +170,7 @@ class Georeference(OneLine):
         position = GeoPoint.from_ecef(ecef_from_cam.translation)
         enu_from_body = position.ecef_from_enu().rotation.T @ ecef_from_cam.rotation @ CAM_FROM_BODY
         w, x, y, z = Rigid3(enu_from_body, np.zeros(3)).quat_wxyz().tolist()
-        return GeoPose(position, Quaternion(x, y, z, w))
+        return GeoPose(position, UnitQuaternion(x, y, z, w))
 
     def heading_deg(self, direction_world: Float[np.ndarray, "3"]) -> float:
         """Return the heading of a direction in degrees clockwise from true north, 0 to 360."""

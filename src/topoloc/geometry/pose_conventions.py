@@ -92,7 +92,7 @@ class PoseConventions:
         return pose
 
     @staticmethod
-    def of(text: str | None) -> PoseConventions:
+    def parse(text: str | None) -> PoseConventions:
         """Parse a text such as ``wxyz,body=1,2,3,0,0,0,1,shift=0.2``. A part that begins with a
         number belongs to the part before it.
 

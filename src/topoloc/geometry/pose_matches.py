@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from topoloc.geometry.absolute_pose_kernels import (
     normal_equations,
-    refine,
+    run_gauss_newton,
     score_outer_products,
     squared_errors,
 )
@@ -56,7 +56,7 @@ def compute_variance_inflation(
         point_covariances: covariances of these points (m^2).
         sigma_px: standard deviation of the pixels.
     """
-    matches = Matches.from_pixels(points_img, points_world, point_covariances, camera, sigma_px)
+    matches = PoseMatches.from_pixels(points_img, points_world, point_covariances, camera, sigma_px)
     used, cells = np.unique(cells_of(points_img, camera.width, camera.height), return_inverse=True)
     if len(used) < _MIN_CELLS:
         return 1.0
@@ -89,7 +89,7 @@ _ESTIMATOR_VARIANCE = 0.8265
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class PoseMatches:
     """Hold the usable matches: pixels, their coordinates and covariances on the plane z = 1, and
     world points."""
 
@@ -107,7 +107,7 @@ class Matches:
         camera: Camera,
         sigma_px: float | Float[np.ndarray, " n"],
         normalized: Float[np.ndarray, "n 2"] | None = None,
-    ) -> Matches:
+    ) -> PoseMatches:
         """Create matches from pixels, world points (metres) and the points' covariances (m^2).
         `sigma_px` is the standard deviation of the pixels, one for all or one for each.
         `normalized` are the pixels on the plane z = 1, if known."""
@@ -115,7 +115,7 @@ class Matches:
             normalized = camera.normalized_from_img(points_img)
         sigmas = np.asarray(sigma_px)[..., None, None]
         to_normalized = sigmas * camera.normalized_jacobian(normalized)
-        return Matches(
+        return PoseMatches(
             points_img=np.ascontiguousarray(points_img, dtype=np.float64),
             normalized=normalized,
             covariances=to_normalized @ to_normalized.transpose(0, 2, 1),
@@ -135,10 +135,12 @@ class Matches:
         )
 
 
-def refine_pose(cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"]) -> Rigid3:
+def refine_pose(
+    cam_from_world: Rigid3, matches: PoseMatches, active: Bool[np.ndarray, " n"]
+) -> Rigid3:
     """Return the pose that fits the active matches best, starting from a nearby pose, in at most 10
     steps."""
-    return Rigid3(*refine(*matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, 10))
+    return Rigid3(*run_gauss_newton(*matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, 10))
 
 
 def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:
@@ -154,7 +156,7 @@ def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:
 
 def estimate_pose_covariance(
     cam_from_world: Rigid3,
-    matches: Matches,
+    matches: PoseMatches,
     active: Bool[np.ndarray, " n"],
     min_noise_scale: float = 1.0,
 ) -> Float[np.ndarray, "6 6"] | None:

@@ -91,7 +91,10 @@ class Rigid3:
 
     def __repr__(self) -> str:
         turn, t = np.degrees(log_so3(self.rotation)), self.translation
-        shown = ", ".join(f"{one:.4g}" for one in t), ", ".join(f"{one:.4g}" for one in turn)
+        shown = (
+            ", ".join(f"{value:.4g}" for value in t),
+            ", ".join(f"{value:.4g}" for value in turn),
+        )
         return f"Rigid3(translation ({shown[0]}) m, rotation vector ({shown[1]}) deg)"
 
     @staticmethod

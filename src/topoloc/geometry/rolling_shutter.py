@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.joint_camera.camera_hypotheses import unchanged_camera
-from topoloc.geometry.joint_camera.joint_fit import Observations, clustered_noise
+from topoloc.geometry.joint_camera.joint_fit import CameraObservations, clustered_noise
 from topoloc.geometry.pose_matches import CAUCHY_SCALE, cells_of, estimate_noise_scale
 from topoloc.geometry.rigid import Rigid3
 
@@ -73,7 +73,7 @@ def find_rotation(
     # 360; after one round, which counts the rotation as noise, -7 to -12 and 1 to 15. Images
     # through a lens that the calibration leaves out had up to 4.
     num_rounds, min_first_log_odds, min_log_odds, evident_log_odds = 5, -3.0, 4.0, 15.0
-    seen = Observations(
+    seen = CameraObservations(
         camera.normalized_from_img(points_img),
         np.asarray(sigmas_px) / camera.fx,
         points_world,
@@ -110,7 +110,7 @@ class _Estimate:
     pose_by_rotation: Float[np.ndarray, "6 3"] = field(default_factory=lambda: np.zeros((6, 3)))
 
     def improved(
-        self, seen: Observations, shares: Float[np.ndarray, " n"], variance: float
+        self, seen: CameraObservations, shares: Float[np.ndarray, " n"], variance: float
     ) -> _Estimate | None:
         """Return the estimate after a round of Gauss-Newton, None if the points do not fix it."""
         jacobian, weights, errors = seen.linearize(self.cam_from_world, unchanged_camera())

@@ -191,7 +191,7 @@ def find_least_median(
     Rousseeuw, *Least median of squares regression*, 1984. More than half of the measurements must
     be right.
     """
-    medians = ((float(np.median(errors(one))), one) for one in hypotheses)
+    medians = ((float(np.median(errors(transform))), transform) for transform in hypotheses)
     median, best = min(medians, key=lambda pair: pair[0])
     return best, median
 

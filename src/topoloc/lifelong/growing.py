@@ -134,7 +134,7 @@ class GrowingMap:
         try:
             posed = run_slam(frames).apply([frames])[0]
             if self._topomap is None:
-                built = build.build_map(posed, self._config, None, ["slam"])
+                built = build.build_node_map(posed, self._config, None, ["slam"])
                 self._write(with_map_statistics(built))
                 poses, shift = number_poses(posed.poses, piece.first), 0.0
             else:

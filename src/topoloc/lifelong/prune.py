@@ -55,7 +55,7 @@ class _FileSize:
     of_node: float
 
     @staticmethod
-    def of(path: Path, kinds: Sequence[str]) -> _FileSize:
+    def measure(path: Path, kinds: Sequence[str]) -> _FileSize:
         """Measure a map's file with these feature types. Raises MapError."""
         lengths = " + ".join(f"total(length({name}))" for name in _POINT_COLUMNS)
         counted = "SELECT count(*), total(length(jpeg)) FROM"
@@ -93,7 +93,7 @@ def measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
     try:
         with temporary_file(path) as tried:
             write_map(topomap, tried)
-            return _FileSize.of(tried, topomap.kinds)
+            return _FileSize.measure(tried, topomap.kinds)
     except OSError as error:
         raise MapError(f"cannot write beside map {path}: {describe_failure(error)}") from error
 
@@ -156,7 +156,7 @@ def prune_map(
     if descriptors == "coarse":
         counted = transform_nodes(counted, partial(quantize_node_descriptors, step=descriptor_step))
     is_same = counted is topomap and topomap.file is not None
-    file = _FileSize.of(path, topomap.kinds) if is_same else measure_file_size(counted, path)
+    file = _FileSize.measure(path, topomap.kinds) if is_same else measure_file_size(counted, path)
     fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes)
     file = file if fewer is counted else measure_file_size(fewer, path)
     return _prune_landmarks(topomap, fewer, path, file, max_bytes)

@@ -59,7 +59,7 @@ class LocalizedStep:
     covariance: Float[np.ndarray, "6 6"]
 
 
-def estimate_noise_scale(
+def fit_noise_scale(
     steps: Sequence[LocalizedStep], motion_scales: Sequence[float], answer_scales: Sequence[float]
 ) -> NoiseScale:
     """Return the pair of factors with the highest likelihood, or 1 and 1 if there are fewer than

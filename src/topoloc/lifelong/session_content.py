@@ -239,7 +239,7 @@ def create_session_content(
     drafts = _draft_nodes(topomap, MapPointLocator(frames, topomap, learnt), weak, progress)
     drafted = {draft.frame: draft.image for draft in drafts}
     covered = queried.keys() - drafted.keys()
-    new = NodePoses.of([image.world_from_cam for image in drafted.values()])
+    new = NodePoses.from_poses([image.world_from_cam for image in drafted.values()])
     first_id = topomap.free_ids.node
     new_ids = [NodeId(first_id + k) for k in range(len(drafts))]
     for done, frame in enumerate(frames):

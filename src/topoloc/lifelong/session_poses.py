@@ -29,8 +29,8 @@ from topoloc.lifelong.scale_estimation import (
     LocalizedStep,
     MotionTolerance,
     NoiseScale,
-    estimate_noise_scale,
     find_motion_consensus,
+    fit_noise_scale,
 )
 from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
@@ -43,14 +43,14 @@ from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import find_source_path
 from topoloc.retrieval.network_images import decode_stored_image
-from topoloc.slam.pose_graph import Edge, optimize_pose_graph
+from topoloc.slam.pose_graph import PoseGraphEdge, optimize_pose_graph
 
 _NUM_QUERIES, _MIN_LOCALIZED = 7, 3
 _FOCAL_LENGTH_RANGE = 1.5  # widens the range around the stated focal length, in both directions
 _MAX_LOG_RATIO = math.log(1.04)
 
 
-def check_calibration(name: str, results: Sequence[Localization | NotLocalized]) -> None:
+def check_query_calibration(name: str, results: Sequence[Localization | NotLocalized]) -> None:
     """Raise CalibrationError if the localization results of a session's images together contradict
     its calibration. The error begins with `name`."""
     for verdict in check_camera_calibrations(results):
@@ -186,7 +186,7 @@ def estimate_poses_by_motion(
         frame = sequence[index]
         results.append(localizer.localize(frame.image, frame.camera))
         progress(f"localizing {sequence.name}", done + 1, len(indices))
-    check_calibration(sequence.name, results)
+    check_query_calibration(sequence.name, results)
     if sum(result.localized for result in results) < MIN_AGREEING and len(indices) >= MIN_AGREEING:
         check_focal_length(sequence, indices, localizer)
     answers = {
@@ -314,14 +314,14 @@ def _optimize_motion(
     cam_from_worlds = [Rigid3.identity(), *((world_from_odom @ odom[k]).inverse() for k in indices)]
     steps = [_relative_motion(odom[a], odom[b]) for a, b in pairwise(indices)]
     edges = [
-        Edge(row, row + 1, step, noise_scale.motion**2 * spread, is_loop=False)
+        PoseGraphEdge(row, row + 1, step, noise_scale.motion**2 * spread, is_loop=False)
         for row, (step, spread) in enumerate(steps, 1)
     ]
     row_of = {index: row for row, index in enumerate(indices, 1)}
     for index, answer in anchors.items():
         covariance = (noise_scale.answers * WIDENED) ** 2 * answer.camera_covariance
         cam_from_world = answer.world_from_cam.inverse()
-        edges.append(Edge(0, row_of[index], cam_from_world, covariance, is_loop=True))
+        edges.append(PoseGraphEdge(0, row_of[index], cam_from_world, covariance, is_loop=True))
     optimised = optimize_pose_graph(cam_from_worlds, edges)[1:]
     return {index: pose.inverse() for index, pose in zip(indices, optimised, strict=True)}
 
@@ -346,7 +346,7 @@ def _estimate_noise(odom: Mapping[int, Rigid3], anchors: Mapping[int, Localizati
             cam_from_world, of_answer = answer.world_from_cam.inverse(), answer.camera_covariance
             seen.append(LocalizedStep(moved, spread, cam_from_world, of_answer))
             moved, spread = Rigid3.identity(), np.zeros((6, 6))
-    return estimate_noise_scale(seen, motion_factors, answer_factors)
+    return fit_noise_scale(seen, motion_factors, answer_factors)
 
 
 def _relative_motion(

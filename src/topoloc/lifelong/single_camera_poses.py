@@ -32,8 +32,8 @@ from topoloc.lifelong.session_poses import (
     SLACK_DEG,
     SessionPoses,
     align_motion_to_map,
-    check_calibration,
     check_focal_length,
+    check_query_calibration,
     select_queried_frames,
 )
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory, correct_trajectory
@@ -116,7 +116,7 @@ def _localize_stream(
         if found.smoothed is not None and isinstance(found.result, Localization):
             localized[index] = found.smoothed, found.result
         progress(f"localizing {sequence.name}", index + 1, len(sequence))
-    check_calibration(sequence.name, results)
+    check_query_calibration(sequence.name, results)
     if len(localized) < MIN_AGREEING:
         check_focal_length(sequence, range(len(sequence)), tracker.localizer)
         raise TrajectoryError(

@@ -348,7 +348,7 @@ def add_session(
         for kind, layer in topomap.layers.items()
     }
     summaries = [*topomap.summaries, *(node.summary for node in content.nodes[topomap.kind])]
-    poses = NodePoses.of([summary.world_from_cam for summary in summaries])
+    poses = NodePoses.from_poses([summary.world_from_cam for summary in summaries])
     nearest = [
         node_distances(frame.world_from_cam, poses, topomap.config.lambda_rot).argmin()
         for frame in frames

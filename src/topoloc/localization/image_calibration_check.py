@@ -36,8 +36,8 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     unchanged_camera,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
+    CameraObservations,
     JointFit,
-    Observations,
     fit_camera,
     linearized_fit,
     weigh_cameras,
@@ -135,7 +135,7 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
     seen, camera = fit.inlier_observations(1.0), fit.camera
     seen = seen.select(np.unique(np.linspace(0, len(seen) - 1, 256).astype(int)))
     points_img = seen.points_img.astype(np.float64)
-    observed = Observations(
+    observed = CameraObservations(
         camera.normalized_from_img(points_img),
         search.config.pose.key_point_sigma_px / camera.fx,
         seen.points_world,

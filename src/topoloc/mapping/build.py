@@ -1,4 +1,4 @@
-"""Build the topo-metric map (section III-A of the paper). Start reading at `build_map`.
+"""Build the topo-metric map (section III-A of the paper). Start reading at `build_node_map`.
 
 The trajectory is discretised into nodes (Eq. 1). Each node keeps its template image, its global
 pose, and its features with their 3-D positions. All mapping images, labelled with their node, train
@@ -62,7 +62,7 @@ from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_
 BuildConfig = MapConfig
 
 
-def build_map(
+def build_node_map(
     sequences: StereoSequence | Sequence[StereoSequence],
     config: BuildConfig | None = None,
     progress: Progress | None = None,
@@ -197,7 +197,7 @@ def _process_mapping_images(
         )
         for kind in config.kinds
     }
-    nodes = NodePoses.of(drafts.world_from_nodes)
+    nodes = NodePoses.from_poses(drafts.world_from_nodes)
     images, lights = list[PlaceImage](), list[Illumination]()
     vlads = {kind: DiskList[np.ndarray]() for kind in config.kinds}
     cells = {kind: [] for kind in config.kinds}

@@ -36,7 +36,9 @@ class ControlPoints:
     names: Sequence[str]
 
     @staticmethod
-    def of(rows: Sequence[tuple[Sequence[float] | np.ndarray, GeoPoint, str]]) -> ControlPoints:
+    def from_rows(
+        rows: Sequence[tuple[Sequence[float] | np.ndarray, GeoPoint, str]],
+    ) -> ControlPoints:
         """Return the points of rows of point, place and name."""
         points, places, names = zip(*rows, strict=True)
         return ControlPoints(np.array(points), places, names)
@@ -54,7 +56,7 @@ def read_control_points(path: Path) -> ControlPoints:
     for line, columns in _read_table(path, 6, 0, "x, y, z, lat, lon, h"):
         point = _parse_numbers(path, line, columns[:3])
         found.append((point, _parse_geo_point(path, line, columns[3:6]), f"line {line}"))
-    return ControlPoints.of(found)
+    return ControlPoints.from_rows(found)
 
 
 def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
@@ -74,7 +76,7 @@ def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
         if columns[0] in positions
     ]
     if named:
-        return ControlPoints.of(named)
+        return ControlPoints.from_rows(named)
     if not all(_is_number(columns[0]) for _, columns in rows):
         example = next(iter(positions), "none")
         raise GeoreferenceError(
@@ -110,7 +112,7 @@ def _interpolate_at_times(
             f"{min(span) / 1e9:.3f} to {max(span) / 1e9:.3f} s" for span in (t_ns, times)
         )
         raise GeoreferenceError(f"{path}: no fix is of a time of the map ({spans})")
-    return ControlPoints.of(found)
+    return ControlPoints.from_rows(found)
 
 
 def _find_positions_by_name(topomap: TopoMetricMap) -> dict[str, Float[np.ndarray, "3"]]:

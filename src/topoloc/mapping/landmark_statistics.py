@@ -56,7 +56,7 @@ class LandmarkStatistics:
     seen: UInt16[np.ndarray, " m"]
 
     @staticmethod
-    def of(
+    def from_equations(
         session_id: int,
         rows: Int[np.ndarray, " m"],
         information: Float[np.ndarray, "m 3 3"],
@@ -89,7 +89,9 @@ class LandmarkStatistics:
         node. Points that it did not expect are left out."""
         rows = np.flatnonzero(expected > 0)
         nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
-        return LandmarkStatistics.of(session_id, rows, *nothing, expected[rows], seen[rows])
+        return LandmarkStatistics.from_equations(
+            session_id, rows, *nothing, expected[rows], seen[rows]
+        )
 
     @property
     def is_count_only(self) -> bool:

@@ -134,7 +134,7 @@ def compute_session_statistics(
         rows = np.flatnonzero(expected[kept] > 0)
         if len(rows):
             of_rows = (sums[kept[rows]] for sums in (information, pulls, expected, num_seen))
-            statistics.append(LandmarkStatistics.of(session_id, rows, *of_rows))
+            statistics.append(LandmarkStatistics.from_equations(session_id, rows, *of_rows))
     return statistics
 
 

@@ -50,7 +50,7 @@ def select_virtual_view_nodes(world_from_nodes: list[Rigid3], config: MapConfig)
     spacing = config.sides.spacing
     if spacing == 0.0:
         return set()
-    poses, reach = NodePoses.of(world_from_nodes), max_opposite * config.d_thresh
+    poses, reach = NodePoses.from_poses(world_from_nodes), max_opposite * config.d_thresh
     d_thresh, lambda_rot = spacing * config.d_thresh, config.lambda_rot / 2.0
     rows = as_rows(select_node_frames(world_from_nodes, d_thresh, lambda_rot))
     return {row for row in rows if not poses.has_opposite(row, reach, -0.7)}

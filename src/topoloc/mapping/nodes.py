@@ -56,7 +56,7 @@ class NodePoses:
     rotations: Float[np.ndarray, "nodes 3 3"]
 
     @staticmethod
-    def of(world_from_nodes: list[Rigid3]) -> NodePoses:
+    def from_poses(world_from_nodes: list[Rigid3]) -> NodePoses:
         """Stack poses (world_from_node) into arrays."""
         return NodePoses(
             positions_of(world_from_nodes),
@@ -122,7 +122,7 @@ def select_node_frames(
     world_from_cams: list[Rigid3], d_thresh: float, lambda_rot: float
 ) -> Int[np.ndarray, " nodes"]:
     """Return the frames along a trajectory that become nodes by Eq. 1."""
-    poses, frame_idx = NodePoses.of(world_from_cams), list[int]()
+    poses, frame_idx = NodePoses.from_poses(world_from_cams), list[int]()
     cells: dict[tuple[int, ...], list[int]] = {}  # selected frames by their cube of side D_thresh
     for k, (world_from_cam, cell) in enumerate(
         zip(world_from_cams, np.floor(poses.centres / d_thresh).tolist(), strict=True)

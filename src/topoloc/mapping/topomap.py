@@ -212,7 +212,7 @@ class TopoMetricMap:
     @cached_property
     def node_poses(self) -> NodePoses:
         """Return the poses of all nodes as arrays."""
-        return NodePoses.of([summary.world_from_cam for summary in self.summaries])
+        return NodePoses.from_poses([summary.world_from_cam for summary in self.summaries])
 
     def max_focal_length_px(self) -> float:
         """Return the focal length (pixels) of the finest mapping camera.
@@ -228,7 +228,7 @@ class TopoMetricMap:
 
         Entries are positions in `poses`, the nearest first.
         """
-        stacked, neighbours = NodePoses.of(poses), list[list[int]]()
+        stacked, neighbours = NodePoses.from_poses(poses), list[list[int]]()
         for k, pose in enumerate(poses):
             distances = node_distances(pose, stacked, self.config.lambda_rot)
             order = np.argsort(distances, kind="stable")[: max_neighbours + 1]

@@ -224,9 +224,9 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
     TopolocError."""
     if path.exists() and not path.is_dir():
         raise TopolocError(f"cannot write {path}: it is no folder")
-    for one in path.rglob("*"):
-        name = one.relative_to(path).as_posix()
-        if name not in files and (one.is_symlink() or not one.is_dir()):
+    for entry in path.rglob("*"):
+        name = entry.relative_to(path).as_posix()
+        if name not in files and (entry.is_symlink() or not entry.is_dir()):
             raise TopolocError(
                 f"cannot write {path}: this folder holds other things, such as {name}"
             )

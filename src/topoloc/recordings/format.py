@@ -71,9 +71,9 @@ def complete_lists(num: int | None, *lists: list[Path]) -> list[list[Path]]:
     found = [dict(zip(*pair, strict=True)) for pair in zip(series, lists, strict=True)]
     is_unique = all(map(len, lists)) and list(map(len, found)) == list(map(len, lists))
     numbers = series[0]
-    if any(one != numbers for one in series):
-        every = {number for one in found for number in one}
-        num_common = sum(all(number in one for one in found) for number in every)
+    if any(numbered != numbers for numbered in series):
+        every = {number for by_number in found for number in by_number}
+        num_common = sum(all(number in by_number for by_number in found) for number in every)
         if not is_unique or 2 * num_common < len(every):
             raise RecordingError(
                 f"{lists[0][0].parent}: {len(lists[0])} pictures here but {len(lists[1])} in"
@@ -86,8 +86,8 @@ def complete_lists(num: int | None, *lists: list[Path]) -> list[list[Path]]:
     if numbers == series[0] == series[-1]:
         return list(lists)
     return [
-        [one.get(number) or _renumbered(paths[0], number) for number in numbers]
-        for one, paths in zip(found, lists, strict=True)
+        [by_number.get(number) or _renumbered(paths[0], number) for number in numbers]
+        for by_number, paths in zip(found, lists, strict=True)
     ]
 
 

@@ -143,7 +143,9 @@ def find_format(
             f" {example}"
         )
     expected = {name: load_format(name).expected_files for name in FORMATS}
-    shared = {name: sum(one in text for one in names) for name, text in expected.items()}
+    shared = {
+        name: sum(name_part in text for name_part in names) for name, text in expected.items()
+    }
     nearest = max(reversed(FORMATS), key=lambda name: shared[name])  # the plain folder first
     guess = f"; nearest is {nearest}: {expected[nearest]}" if shared[nearest] else ""
     held = ", ".join(names[:4]) + " ..." * (len(names) > 4)

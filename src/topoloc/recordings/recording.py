@@ -110,7 +110,7 @@ class Recording(IndexedFrames):
 
     def paths_of(self, index: int) -> list[Path]:
         """Return the image files of a frame."""
-        others = [one.paths[index] for one in (self.right, self.depth) if one is not None]
+        others = [images.paths[index] for images in (self.right, self.depth) if images is not None]
         return [self.root / self.names[index], *others]
 
     @cached_property

@@ -98,8 +98,8 @@ class RosCalibration:
             return StereoRig(self.camera(True), right.camera(True), rect_right_from_rect_left)
         try:
             rect_from_left, rect_from_right = (
-                Rigid3.from_matrix(np.block([[one.rotation, np.zeros((3, 1))], [0, 0, 0, 1]]))
-                for one in (self, right)
+                Rigid3.from_matrix(np.block([[camera.rotation, np.zeros((3, 1))], [0, 0, 0, 1]]))
+                for camera in (self, right)
             )
         except TrajectoryError as error:
             raise CalibrationError(

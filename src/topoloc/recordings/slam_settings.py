@@ -102,7 +102,7 @@ def _values(path: Path, text: str, section: str, names: str) -> list[float]:
     found = [yaml_numbers(text, prefix + name)[:1] for name in names.split()]
     if missing := [name for name, one in zip(names.split(), found, strict=True) if not one]:
         raise CalibrationError(f"{path}: {section}{missing[0]} is missing, or not a number")
-    return [one[0] for one in found]
+    return [values[0] for values in found]
 
 
 def _find_size(text: str, width: str, height: str, size: _Size) -> _Size:

@@ -147,7 +147,7 @@ def _squeezenet_features() -> nn.Sequential:
         ((128, 32, 128), (256, 32, 128)),
         ((256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256)),
     ):
-        modules += [nn.MaxPool2d(3, stride=2, ceil_mode=True), *(_Fire(*one) for one in pooled)]
+        modules += [nn.MaxPool2d(3, stride=2, ceil_mode=True), *(_Fire(*sizes) for sizes in pooled)]
     return nn.Sequential(*modules)
 
 

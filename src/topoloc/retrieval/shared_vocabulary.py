@@ -79,7 +79,7 @@ def shared_vocabulary(kind: str) -> SharedVocabulary | None:
     """Return the vocabulary of a feature type, or None if there is none."""
     folder = resources.files("topoloc.retrieval").joinpath(_FOLDER)
     # the name may come from a file: it is compared, and never a part of a path
-    path = next((one for one in folder.iterdir() if one.name == f"{kind}.npz"), None)
+    path = next((file for file in folder.iterdir() if file.name == f"{kind}.npz"), None)
     if path is None:
         return None
     with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:

@@ -189,7 +189,7 @@ class SurfVlad:
             cells: cells of each mapping image, or None if the feature type has none.
         """
         whitening = learn_whitening(vlads, config.dimension)
-        known = [one for one in cells if one is not None]
+        known = [cell for cell in cells if cell is not None]
         grid = CellGrid.fit(np.stack(known)) if len(known) == len(vlads) else None
         starts = range(0, len(vlads), _BLOCK)
         vectors = np.concatenate(
@@ -236,7 +236,9 @@ class SurfVlad:
             node_ids: node of each image.
         """
         vectors = np.stack([self._global_descriptor(*image) for image in images_with_features])
-        cells = [one.cells for one, _, _ in images_with_features if one.cells is not None]
+        cells = [
+            features.cells for features, _, _ in images_with_features if features.cells is not None
+        ]
         grid = (
             self._grid.with_cells(np.stack(cells))
             if self._grid is not None and len(cells) == len(images_with_features)

@@ -18,7 +18,7 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.pose_matches import Matches
+from topoloc.geometry.pose_matches import PoseMatches
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import camera_from_intrinsics
 from topoloc.recordings.frame import StereoSequence
@@ -151,7 +151,7 @@ def _focal_cost(points: MatchedPoints, factor: float) -> float:
     pose = estimate_absolute_pose(pixels, stretched[0], camera, point_covariances=stretched[1])
     if pose is None:
         return math.inf
-    matches = Matches.from_pixels(pixels, *stretched, camera, 1.0)
+    matches = PoseMatches.from_pixels(pixels, *stretched, camera, 1.0)
     squares = squared_errors(*matches.kernel_args(pose.cam_from_world))
     squares = squares[np.isfinite(squares)]  # points in front of the camera
     return float(cauchy_square * np.log1p(squares / cauchy_square).sum())

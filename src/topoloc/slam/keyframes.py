@@ -50,7 +50,7 @@ class Landmarks:
 
 
 @dataclass(eq=False)
-class Observations:
+class KeyFrameObservations:
     """Hold the landmark observations of one key frame.
 
     `measured` is pixel and disparity (x, y, d), `weights` the inverse standard deviations. An
@@ -74,7 +74,7 @@ class Observations:
         """Return the landmarks that are no outliers."""
         return self.landmark_ids[self.active]
 
-    def append(self, other: Observations) -> None:
+    def append(self, other: KeyFrameObservations) -> None:
         """Append the rows of other observations."""
         for name, rows in vars(other).items():
             setattr(self, name, np.concatenate([getattr(self, name), rows]))
@@ -114,7 +114,7 @@ class KeyFrame:
     submap: int
     stereo: StereoCamera
     cam_from_world: Rigid3
-    observations: Observations
+    observations: KeyFrameObservations
     bias: DisparityBias
     motion: Motion | None = None
     places: DiskList[PlaceFeatures] = field(default_factory=lambda: DiskList[PlaceFeatures]())

@@ -25,9 +25,9 @@ from topoloc.slam.bundle.bundle_adjustment import adjust_bundle, adjust_window
 from topoloc.slam.keyframes import (
     FramePose,
     KeyFrame,
+    KeyFrameObservations,
     Landmarks,
     Motion,
-    Observations,
     triangulate_points,
 )
 from topoloc.slam.step_estimation import FrameTracker, LastFrame, Step, Tracks
@@ -254,7 +254,9 @@ class MonocularOdometry(FrameTracker):
         normalized = measured.view.camera.normalized_from_img(corners.astype(np.float64))
         return cam_from_world.inverse().apply(np.column_stack([normalized * z[:, None], z]))
 
-    def _make_observations(self, landmarks: Tracks, *untriangulated: Tracks) -> Observations:
+    def _make_observations(
+        self, landmarks: Tracks, *untriangulated: Tracks
+    ) -> KeyFrameObservations:
         """Return the observations of a key frame. Untriangulated points are not active.
 
         The standard deviation of a pixel grows with the square of the tracking uncertainty (from
@@ -270,9 +272,11 @@ class MonocularOdometry(FrameTracker):
         weights = np.column_stack([1.0 / sigmas, 1.0 / sigmas, np.zeros(num)])
         measured = np.column_stack([tracks.points_img.astype(np.float64), np.full(num, np.nan)])
         is_active = np.arange(num) < len(landmarks.landmark_ids)
-        return Observations(tracks.landmark_ids, measured, weights, is_active)
+        return KeyFrameObservations(tracks.landmark_ids, measured, weights, is_active)
 
-    def _make_keyframe(self, image: _Image, cam_from_world: Rigid3, seen: Observations) -> KeyFrame:
+    def _make_keyframe(
+        self, image: _Image, cam_from_world: Rigid3, seen: KeyFrameObservations
+    ) -> KeyFrame:
         t_ns, stereo, submap = image.t_ns, image.measured.stereo, len(self.submaps)
         return KeyFrame(0, image.frame_idx, t_ns, submap, stereo, cam_from_world, seen, self._bias)
 

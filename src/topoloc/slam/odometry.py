@@ -29,9 +29,9 @@ from topoloc.slam.input_checks import measure_right_residuals
 from topoloc.slam.keyframes import (
     FramePose,
     KeyFrame,
+    KeyFrameObservations,
     Landmarks,
     Motion,
-    Observations,
     PlaceFeatures,
 )
 from topoloc.slam.motion_prediction import select_expected_pose
@@ -169,7 +169,7 @@ class Odometry(FrameTracker):
             submap,
             measured.stereo,
             cam_from_world,
-            Observations(ids, values[rows], weights, np.ones(len(ids), np.bool_)),
+            KeyFrameObservations(ids, values[rows], weights, np.ones(len(ids), np.bool_)),
             self._bias,
             motion,
             self._place_features,

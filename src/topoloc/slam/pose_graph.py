@@ -17,7 +17,7 @@ from topoloc.slam.bundle.block_system import BlockPattern, solve_blocks
 
 
 @dataclass(frozen=True, eq=False)
-class Edge:
+class PoseGraphEdge:
     """Hold second_from_first and the covariance of its left perturbation.
 
     A loop may be wrong and has a robust loss. A motion is always right.
@@ -32,7 +32,7 @@ class Edge:
 
 def optimize_pose_graph(
     cam_from_worlds: Sequence[Rigid3],
-    edges: Sequence[Edge],
+    edges: Sequence[PoseGraphEdge],
     max_steps: int = 15,
     min_step: float = 1e-5,
 ) -> list[Rigid3]:
@@ -76,7 +76,7 @@ def optimize_pose_graph(
 
 
 def compute_normalized_residuals(
-    poses: Sequence[Rigid3], edges: Sequence[Edge]
+    poses: Sequence[Rigid3], edges: Sequence[PoseGraphEdge]
 ) -> Float[np.ndarray, " e"]:
     """Return the length of each edge's residual, in standard deviations."""
     squares = [

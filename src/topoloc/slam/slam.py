@@ -34,11 +34,11 @@ from topoloc.recordings.recording import with_poses
 from topoloc.slam.bundle.bundle_adjustment import adjust_bundle
 from topoloc.slam.calibration_checks import find_image_faults
 from topoloc.slam.input_checks import check_stereo
-from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, Motion, Observations
+from topoloc.slam.keyframes import FramePose, KeyFrame, KeyFrameObservations, Landmarks, Motion
 from topoloc.slam.loop_closure import Link, find_links
 from topoloc.slam.odometry import Odometry
 from topoloc.slam.place_matching import extract_place_features
-from topoloc.slam.pose_graph import Edge, compute_normalized_residuals, optimize_pose_graph
+from topoloc.slam.pose_graph import PoseGraphEdge, compute_normalized_residuals, optimize_pose_graph
 from topoloc.slam.submap_joins import find_joins, group_submaps
 
 
@@ -98,22 +98,26 @@ def close_loops(
     return kept
 
 
-def _motion_edge(keyframe: KeyFrame, given: Motion, index: dict[int, int]) -> Edge:
+def _motion_edge(keyframe: KeyFrame, given: Motion, index: dict[int, int]) -> PoseGraphEdge:
     sigma_share = 0.004  # sigma of a motion between two key frames, as a share of its length
     # Sigma of a motion between two key frames, degrees, in addition to that of tracking.
     sigma_deg = 0.02
     motion = keyframe.cam_from_world @ given.source.cam_from_world.inverse()
     metres = sigma_share * float(np.linalg.norm(motion.translation)) + 1e-3
     covariance = given.covariance + diagonal_covariance(metres, sigma_deg)
-    return Edge(index[id(given.source)], index[id(keyframe)], motion, covariance, is_loop=False)
+    return PoseGraphEdge(
+        index[id(given.source)], index[id(keyframe)], motion, covariance, is_loop=False
+    )
 
 
-def _link_edge(link: Link) -> Edge:
+def _link_edge(link: Link) -> PoseGraphEdge:
     # Factor of the PnP covariance of a link, because matched features of one view have correlated
     # errors.
     covariance_scale = 4.0
     covariance = covariance_scale * link.match.covariance + diagonal_covariance(0.01, 0.1)
-    return Edge(link.source, link.target, link.match.target_from_source, covariance, is_loop=True)
+    return PoseGraphEdge(
+        link.source, link.target, link.match.target_from_source, covariance, is_loop=True
+    )
 
 
 def _move_keyframes(
@@ -162,7 +166,7 @@ def _add_link_landmarks(
                 keyframe.observations.append(_feature_observation(keyframe, row, known))
 
 
-def _feature_observation(keyframe: KeyFrame, row: int, landmark_id: int) -> Observations:
+def _feature_observation(keyframe: KeyFrame, row: int, landmark_id: int) -> KeyFrameObservations:
     """Return a local feature as an observation: its pixel, and its disparity if it has a depth."""
     sigma_px = 0.8  # standard deviation of a feature's pixel in the global bundle adjustment
     place, stereo = keyframe.place, keyframe.stereo
@@ -172,7 +176,7 @@ def _feature_observation(keyframe: KeyFrame, row: int, landmark_id: int) -> Obse
         depth = place.points.points_cam[row, 2]
         measured[0, 2] = stereo.bf / depth
         weights[0, 2] = depth**2 / (stereo.bf * np.sqrt(place.points.covariances[row, 2, 2]))
-    return Observations(np.array([landmark_id]), measured, weights, np.ones(1, np.bool_))
+    return KeyFrameObservations(np.array([landmark_id]), measured, weights, np.ones(1, np.bool_))
 
 
 Progress = Callable[[str, int, int], None]

@@ -31,7 +31,7 @@ from topoloc.recordings.frame import to_grey
 from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
-from topoloc.tracking.motion import Hypothesis, MotionState, update_motion
+from topoloc.tracking.motion import MotionHypothesis, MotionState, update_motion
 from topoloc.tracking.point_tracker import PointTracker
 from topoloc.tracking.pose_hypotheses import PoseHypotheses
 from topoloc.tracking.stream_localizer import (
@@ -60,7 +60,7 @@ class MapStream:
     hypothesis that no image has confirmed."""
 
     def __init__(
-        self, localizer: Localizer, config: TrackerConfig, prior: Hypothesis | None = None
+        self, localizer: Localizer, config: TrackerConfig, prior: MotionHypothesis | None = None
     ) -> None:
         self.localizer, self.config, self._window = localizer, config, PoseWindow()
         self._hypotheses = PoseHypotheses(config.hypotheses.motion, prior)

@@ -129,7 +129,7 @@ def update_motion(
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class MotionHypothesis:
     """Hold one hypothesis.
 
     `state` and `odom_from_cam` belong to the last measured pose, `current` to the current image.
@@ -148,23 +148,25 @@ class Hypothesis:
 
     def measured(
         self, state: MotionState, odom_from_cam: Rigid3 | None, **changes: Any
-    ) -> Hypothesis:
+    ) -> MotionHypothesis:
         """Return the hypothesis with the state measured in the current image."""
         return replace(self, state=state, current=state, odom_from_cam=odom_from_cam, **changes)
 
 
-def merge_duplicates(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+def merge_duplicates(hypotheses: list[MotionHypothesis]) -> list[MotionHypothesis]:
     """Merge hypotheses with the same pose and velocity, and prefer those measured now."""
-    kept: list[Hypothesis] = []
-    least = 1e-4 * max(one.weight for one in hypotheses)
-    heavy = [one for one in hypotheses if one.weight > least]
-    for one in sorted(heavy, key=lambda one: (one.candidate_idx is None, -one.weight)):
+    kept: list[MotionHypothesis] = []
+    least = 1e-4 * max(hypothesis.weight for hypothesis in hypotheses)
+    heavy = [hypothesis for hypothesis in hypotheses if hypothesis.weight > least]
+    for hypothesis in sorted(
+        heavy, key=lambda hypothesis: (hypothesis.candidate_idx is None, -hypothesis.weight)
+    ):
         for k, other in enumerate(kept):
-            if _is_same_motion(one.current, other.current):
-                kept[k] = replace(other, weight=other.weight + one.weight)
+            if _is_same_motion(hypothesis.current, other.current):
+                kept[k] = replace(other, weight=other.weight + hypothesis.weight)
                 break
         else:
-            kept.append(one)
+            kept.append(hypothesis)
     return kept
 
 

@@ -27,8 +27,8 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
 from topoloc.node_ids import NodeId
 from topoloc.tracking.motion import (
-    Hypothesis,
     MotionConfig,
+    MotionHypothesis,
     MotionState,
     is_same_place,
     merge_duplicates,
@@ -64,9 +64,9 @@ class PoseHypotheses:
     prediction_scale: ClassVar[float] = 2.5
     """Factor on the sigma of the prediction, because hands jerk and wheels hit kerbs."""
 
-    def __init__(self, motion: MotionConfig, prior: Hypothesis | None = None) -> None:
+    def __init__(self, motion: MotionConfig, prior: MotionHypothesis | None = None) -> None:
         self.motion, self.is_track_continued = motion, False
-        self._ranked = list[Hypothesis]() if prior is None else [prior]
+        self._ranked = list[MotionHypothesis]() if prior is None else [prior]
         self._null_weight = 1.0 if prior is None else 1.0 - prior.weight
 
     @property
@@ -96,15 +96,17 @@ class PoseHypotheses:
         """Return the poses at the current image, likeliest first. Hypotheses with the same pose
         and different velocities are merged."""
         found = list[Alternative]()
-        for one in self._ranked:
-            pose = one.current.world_from_cam
+        for hypothesis in self._ranked:
+            pose = hypothesis.current.world_from_cam
             for k, other in enumerate(found):
                 if is_same_place(other.world_from_cam, pose):
-                    found[k] = structs.replace(other, probability=other.probability + one.weight)
+                    found[k] = structs.replace(
+                        other, probability=other.probability + hypothesis.weight
+                    )
                     break
             else:
-                found.append(Alternative(pose, one.weight, one.node_id))
-        return tuple(sorted(found, key=lambda one: -one.probability))
+                found.append(Alternative(pose, hypothesis.weight, hypothesis.node_id))
+        return tuple(sorted(found, key=lambda alternative: -alternative.probability))
 
     def seconds_since(self, t_ns: int) -> float:
         """Return the seconds since the last measured pose, infinite if there is none."""
@@ -117,17 +119,17 @@ class PoseHypotheses:
         """
         max_seconds = 1.0  # seconds without a measured pose after which a hypothesis is dropped
         max_seconds_with_odometry = 20.0  # the same with external odometry
-        before, alive = self._ranked, list[Hypothesis]()
-        for one in before:
+        before, alive = self._ranked, list[MotionHypothesis]()
+        for hypothesis in before:
             motion, limit = None, max_seconds
-            if one.odom_from_cam is not None and odom_from_cam is not None:
-                motion = one.odom_from_cam.inverse() @ odom_from_cam
+            if hypothesis.odom_from_cam is not None and odom_from_cam is not None:
+                motion = hypothesis.odom_from_cam.inverse() @ odom_from_cam
                 limit = max_seconds_with_odometry
-            if t_ns - one.state.t_ns <= limit * 1e9:
-                current = predict_motion(one.state, t_ns, self.motion, motion)
-                alive.append(replace(one, current=current, candidate_idx=None))
+            if t_ns - hypothesis.state.t_ns <= limit * 1e9:
+                current = predict_motion(hypothesis.state, t_ns, self.motion, motion)
+                alive.append(replace(hypothesis, current=current, candidate_idx=None))
         self.is_track_continued = bool(alive) and alive[0].state is before[0].state
-        left = sum(one.weight for one in alive)
+        left = sum(hypothesis.weight for hypothesis in alive)
         # dropped weight counts as "elsewhere"
         self._prune(alive if self.is_track_continued or left > 0.5 else [], 1.0 - left)
         return self.best
@@ -164,11 +166,13 @@ class PoseHypotheses:
         """Update all hypotheses with tracked points. The points measure the best hypothesis at
         this pose. The others move by the same motion."""
         self._ranked = [
-            one.measured(
-                update_motion(one.current, one.from_best @ world_from_cam, covariance),
+            hypothesis.measured(
+                update_motion(
+                    hypothesis.current, hypothesis.from_best @ world_from_cam, covariance
+                ),
                 odom_from_cam,
             )
-            for one in self._ranked
+            for hypothesis in self._ranked
         ]
 
     def update_weights(
@@ -191,37 +195,42 @@ class PoseHypotheses:
         kept_share = 0.6
         miss_ambiguous = 0.1  # minimum probability that the true pose is not among the alternatives
         if not candidates:
-            kept = [replace(one, weight=kept_share * one.weight) for one in self._ranked]
+            kept = [
+                replace(hypothesis, weight=kept_share * hypothesis.weight)
+                for hypothesis in self._ranked
+            ]
             self._prune(kept, self._null_weight)
             return
         before, is_single = self.best, len(candidates) == 1
         none = max(
             self.miss if is_single else miss_ambiguous,
-            1.0 - sum(one.probability for one in candidates),
+            1.0 - sum(candidate.probability for candidate in candidates),
         )
-        new, others = list[Hypothesis](), self._ranked
+        new, others = list[MotionHypothesis](), self._ranked
         if is_single:
             new, others = self._merge_consistent(candidates[0], odom_from_cam, new_evidence_ratio)
-        for one in others:
+        for hypothesis in others:
             updated = (
-                self._update_with_candidate(one, number, candidate, odom_from_cam)
+                self._update_with_candidate(hypothesis, number, candidate, odom_from_cam)
                 for number, candidate in enumerate(candidates)
             )
             children = [child for child in updated if child is not None]
-            children.append(replace(one, weight=one.weight * none))
-            gain = sum(child.weight for child in children) / one.weight
+            children.append(replace(hypothesis, weight=hypothesis.weight * none))
+            gain = sum(child.weight for child in children) / hypothesis.weight
             factor = gain ** (new_evidence_ratio - 1.0)
             new += [replace(child, weight=child.weight * factor) for child in children]
         for number, candidate in enumerate(candidates):
             weight = self._null_weight * candidate.probability * new_evidence_ratio
-            own = [k for k, one in enumerate(new) if one.candidate_idx == number]
+            own = [k for k, hypothesis in enumerate(new) if hypothesis.candidate_idx == number]
             heaviest = max(own, key=lambda k: new[k].weight, default=None)
             if heaviest is not None and new[heaviest].weight >= weight:
                 new[heaviest] = replace(new[heaviest], weight=new[heaviest].weight + weight)
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance)
                 pose, node_id = Rigid3.identity(), candidate.node_id
-                new.append(Hypothesis(state, odom_from_cam, state, weight, node_id, pose, number))
+                new.append(
+                    MotionHypothesis(state, odom_from_cam, state, weight, node_id, pose, number)
+                )
         self._prune(merge_duplicates(new), self._null_weight * none**new_evidence_ratio)
         best = self.leader
         self.is_track_continued = before is not None and self.is_consistent(
@@ -237,64 +246,80 @@ class PoseHypotheses:
 
     def _merge_consistent(
         self, candidate: Candidate, odom_from_cam: Rigid3 | None, new_evidence_ratio: float
-    ) -> tuple[list[Hypothesis], list[Hypothesis]]:
+    ) -> tuple[list[MotionHypothesis], list[MotionHypothesis]]:
         """Merge the hypotheses consistent with a single pose into one. Return it, and the others.
 
         The motion is that of the likeliest of them.
         """
         pose, covariance = candidate.world_from_cam, candidate.covariance
-        weight, likeliest, others = 0.0, list[tuple[float, Hypothesis]](), list[Hypothesis]()
-        for one in self._ranked:
-            updated = self._update_with_candidate(one, 0, candidate, odom_from_cam)
+        weight, likeliest, others = (
+            0.0,
+            list[tuple[float, MotionHypothesis]](),
+            list[MotionHypothesis](),
+        )
+        for hypothesis in self._ranked:
+            updated = self._update_with_candidate(hypothesis, 0, candidate, odom_from_cam)
             if updated is None:
-                others.append(one)
+                others.append(hypothesis)
                 continue
-            predicted = one.current.world_from_cam
-            gate = self._gate_covariance(one.current, covariance)
+            predicted = hypothesis.current.world_from_cam
+            gate = self._gate_covariance(hypothesis.current, covariance)
             surprised = math.exp(-0.5 * predicted.squared_distance(pose, gate))
-            weight += one.weight * (candidate.probability * surprised) ** new_evidence_ratio
-            both = one.current.pose_covariance + covariance
+            weight += hypothesis.weight * (candidate.probability * surprised) ** new_evidence_ratio
+            both = hypothesis.current.pose_covariance + covariance
             spread = float(np.linalg.slogdet(both)[1])
             square = predicted.squared_distance(pose, both)
-            likeliest.append((math.log(one.weight) - 0.5 * (square + spread), updated))
+            likeliest.append((math.log(hypothesis.weight) - 0.5 * (square + spread), updated))
         if not likeliest:
             return [], others
         _, best = max(likeliest, key=lambda pair: pair[0])
         return [replace(best, weight=weight)], others
 
     def _update_with_candidate(
-        self, one: Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
-    ) -> Hypothesis | None:
+        self,
+        hypothesis: MotionHypothesis,
+        number: int,
+        candidate: Candidate,
+        odom_from_cam: Rigid3 | None,
+    ) -> MotionHypothesis | None:
         """Return the hypothesis updated by a candidate, weighted by its likelihood.
 
         None if the candidate is not consistent with it.
         """
-        pose, covariance, now = candidate.world_from_cam, candidate.covariance, one.current
+        pose, covariance, now = candidate.world_from_cam, candidate.covariance, hypothesis.current
         if not self.is_consistent(now, pose, covariance):
             return None
         square = now.world_from_cam.squared_distance(pose, now.pose_covariance + covariance)
-        weight = one.weight * candidate.probability * max(math.exp(-0.5 * square), 1e-100)
+        weight = hypothesis.weight * candidate.probability * max(math.exp(-0.5 * square), 1e-100)
         state, changes = update_motion(now, pose, covariance), {"node_id": candidate.node_id}
-        return one.measured(state, odom_from_cam, weight=weight, candidate_idx=number, **changes)
+        return hypothesis.measured(
+            state, odom_from_cam, weight=weight, candidate_idx=number, **changes
+        )
 
-    def _prune(self, hypotheses: list[Hypothesis], elsewhere: float) -> None:
+    def _prune(self, hypotheses: list[MotionHypothesis], elsewhere: float) -> None:
         """Keep the hypotheses with the highest weights and normalise the weights."""
         max_number = 24  # maximum number of hypotheses, those with the highest weights
         min_weight = 0.002  # minimum weight of a hypothesis
         # Minimum probability that the camera is at none of the hypotheses, because it was
         # carried or all are wrong.
         min_elsewhere = 0.0005
-        whole = sum(one.weight for one in hypotheses) + elsewhere
-        heaviest = sorted(hypotheses, key=lambda one: -one.weight)[:max_number]
-        kept = [one for one in heaviest if one.weight >= min_weight * whole] or heaviest[:1]
+        whole = sum(hypothesis.weight for hypothesis in hypotheses) + elsewhere
+        heaviest = sorted(hypotheses, key=lambda hypothesis: -hypothesis.weight)[:max_number]
+        kept = [
+            hypothesis for hypothesis in heaviest if hypothesis.weight >= min_weight * whole
+        ] or heaviest[:1]
         self._null_weight = max(elsewhere / whole, min_elsewhere) if kept else 1.0
-        share = (1.0 - self._null_weight) / max(sum(one.weight for one in kept), 1e-300)
-        self._ranked = [replace(one, weight=share * one.weight) for one in kept]
+        share = (1.0 - self._null_weight) / max(
+            sum(hypothesis.weight for hypothesis in kept), 1e-300
+        )
+        self._ranked = [
+            replace(hypothesis, weight=share * hypothesis.weight) for hypothesis in kept
+        ]
 
     def _update_relative_poses(self) -> None:
         """Compute the transforms from the best hypothesis to each one."""
         best_from_world = self._ranked[0].current.world_from_cam.inverse()
         self._ranked = [
-            replace(one, from_best=one.current.world_from_cam @ best_from_world)
-            for one in self._ranked
+            replace(hypothesis, from_best=hypothesis.current.world_from_cam @ best_from_world)
+            for hypothesis in self._ranked
         ]

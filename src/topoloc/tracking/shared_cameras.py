@@ -25,8 +25,8 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     Matrix,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
+    CameraObservations,
     JointFit,
-    Observations,
     fit_camera,
     linearized_fit,
     weigh_cameras,
@@ -166,7 +166,9 @@ class _CameraEstimate:
         self._places.add(f"{best.provenance.tile}/{best.node_id}")
         depth = float(np.median(pose.inverse().apply(inliers.points_world)[:, 2]))
         # a viewpoint near a known one shows the same points alike
-        if not any(pose.is_same(one, max_share * depth, max_angle) for one in self._viewpoints):
+        if not any(
+            pose.is_same(viewpoint, max_share * depth, max_angle) for viewpoint in self._viewpoints
+        ):
             self._viewpoints.append(pose)
         if len(self._seen) >= MIN_IMAGES and len(self._places) >= MIN_PLACES:
             self.shared = self._estimate()
@@ -182,11 +184,11 @@ class _CameraEstimate:
             self._prior,
         )
 
-    def _observations(self, inliers: PointObservations) -> Observations:
+    def _observations(self, inliers: PointObservations) -> CameraObservations:
         rows = np.linspace(0, len(inliers) - 1, 256)  # their noise is the smallest error
         seen = inliers.select(np.unique(rows.astype(int)))
         points_img, camera = seen.points_img.astype(np.float64), self._reference
-        return Observations(
+        return CameraObservations(
             camera.normalized_from_img(points_img),
             self.localizer.config.pose.key_point_sigma_px / camera.fx,
             seen.points_world,
@@ -201,7 +203,7 @@ class _CameraEstimate:
         max_focal_sigma = 0.01  # more moves a pose by several of its sigmas
         together = combine_likelihoods(self._seen, self._prior, len(self._viewpoints))
         weighed = weigh_cameras(together, self._prior)
-        chosen = max(weighed, key=lambda one: weighed[one][0])
+        chosen = max(weighed, key=lambda hypothesis: weighed[hypothesis][0])
         _, mean, covariance = weighed[chosen]
         if chosen.lens == "other" or math.sqrt(covariance[0, 0]) > max_focal_sigma:
             return None
@@ -217,11 +219,11 @@ def combine_likelihoods(
     of one viewpoint share the errors of its points, so the information is scaled to the number of
     viewpoints, and to the scatter of the images beyond their noise."""
     median_chi_square = 7.344  # of eight
-    mean, covariance = prior.of(CameraHypothesis(False, "xy", "other"))
-    each = [one.posteriors(mean[None], covariance[None]) for one in seen]
+    mean, covariance = prior.moments(CameraHypothesis(False, "xy", "other"))
+    each = [likelihood.posteriors(mean[None], covariance[None]) for likelihood in seen]
     estimates, inverse = (
-        np.stack([one[1][0] for one in each]),
-        np.linalg.inv(np.stack([one[2][0] for one in each])),
+        np.stack([posterior[1][0] for posterior in each]),
+        np.linalg.inv(np.stack([posterior[2][0] for posterior in each])),
     )
     centre, squares = np.median(estimates, axis=0), np.zeros(len(seen))
     weights = np.ones(len(seen))
@@ -234,6 +236,10 @@ def combine_likelihoods(
         centre = np.linalg.solve(weighted.sum(axis=0), np.einsum("nij,nj->i", weighted, estimates))
     scatter = max(1.0, float(np.median(squares)) / median_chi_square) * len(seen) / num_viewpoints
     return CameraLikelihood(
-        np.einsum("n,nij->ij", weights / scatter, np.stack([one.information for one in seen])),
-        np.einsum("n,ni->i", weights / scatter, np.stack([one.pull for one in seen])),
+        np.einsum(
+            "n,nij->ij",
+            weights / scatter,
+            np.stack([likelihood.information for likelihood in seen]),
+        ),
+        np.einsum("n,ni->i", weights / scatter, np.stack([likelihood.pull for likelihood in seen])),
     )

@@ -79,10 +79,10 @@ class StreamLocalizer:
                 if expected.is_refutable:
                     self._hypotheses.update_weights(frame.t_ns, [])
                 return refusal
-        candidates = [one.as_candidate(pose_covariance) for one in found]
+        candidates = [localized.as_candidate(pose_covariance) for localized in found]
         if len(candidates) != 1 or not self._hypotheses.is_expected(candidates[0]):
             refusal, found = self._localize_globally(frame)
-            candidates = [one.as_candidate(pose_covariance) for one in found]
+            candidates = [localized.as_candidate(pose_covariance) for localized in found]
         self._hypotheses.update_weights(
             frame.t_ns, candidates, frame.odom_from_cam, self._compute_new_evidence(found)
         )
@@ -106,7 +106,7 @@ class StreamLocalizer:
         if before is None or not self._hypotheses.is_track_continued:
             return 1.0
         moved = before.inverse() @ best.world_from_cam
-        depth = float(np.median([one.errors.depth for one in found]))
+        depth = float(np.median([localized.errors.depth for localized in found]))
         way = float(np.linalg.norm(moved.translation)) / depth + moved.angle()
         return 1.0 - math.exp(-way / (renewal if len(found) > 1 else renewal_alone))
 
@@ -130,12 +130,14 @@ class StreamLocalizer:
             if not _is_known_pose(hypothesis.world_from_cam, known):
                 around = self._query_localizer(frame, hypothesis.world_from_cam)[1]
                 known += [
-                    one for one in around if not _is_known_pose(one.result.world_from_cam, known)
+                    localized
+                    for localized in around
+                    if not _is_known_pose(localized.result.world_from_cam, known)
                 ]
         shares = [len(found) if k < len(found) else 1 for k in range(len(known))]
         return refusal, [
-            replace(one, probability=one.probability * share / len(known))
-            for one, share in zip(known, shares, strict=True)
+            replace(localized, probability=localized.probability * share / len(known))
+            for localized, share in zip(known, shares, strict=True)
         ]
 
     def _query_localizer(
@@ -147,15 +149,16 @@ class StreamLocalizer:
             QueryImage(frame.image, frame.camera), near, frame.limit
         )
         refusal, found = result if isinstance(result, NotLocalized) else None, list[LocalizedPose]()
-        for one, points in named:
-            probability = one.probability
+        for localization, points in named:
+            probability = localization.probability
             if refusal is None:
-                share = share_of_this_floor(one.appearance, self._has_look_alikes)
-                place = _place_probability(one) / max(share, 1e-9)  # the stream judges the floor
+                share = share_of_this_floor(localization.appearance, self._has_look_alikes)
+                # The stream judges the floor.
+                place = _place_probability(localization) / max(share, 1e-9)
                 probability = min(place, 1.0 - self._hypotheses.miss)
-            depths = one.world_from_cam.inverse().apply(points.points_world)[:, 2]
-            errors = compute_pose_errors(one, float(np.median(depths)))
-            found.append(LocalizedPose(one, points, errors, probability))
+            depths = localization.world_from_cam.inverse().apply(points.points_world)[:, 2]
+            errors = compute_pose_errors(localization, float(np.median(depths)))
+            found.append(LocalizedPose(localization, points, errors, probability))
         return refusal, found
 
 
@@ -170,7 +173,9 @@ def _place_probability(found: Localization) -> float:
 
 
 def _is_known_pose(world_from_cam: Rigid3, found: list[LocalizedPose]) -> bool:
-    return any(is_same_place(one.result.world_from_cam, world_from_cam) for one in found)
+    return any(
+        is_same_place(localized.result.world_from_cam, world_from_cam) for localized in found
+    )
 
 
 def reject_jump(found: Localization) -> NotLocalized:

@@ -24,7 +24,7 @@ from topoloc.recordings.frame import find_time_problem
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.map_stream import MapStream
-from topoloc.tracking.motion import Hypothesis, start_motion
+from topoloc.tracking.motion import MotionHypothesis, start_motion
 from topoloc.tracking.shared_cameras import SharedCameras
 from topoloc.tracking.stream_result import StreamedPose
 
@@ -135,7 +135,7 @@ class Tracker:
         state = start_motion(t_ns, world_from_cam, local)
         node_id = self._stream.localizer.topomap.summaries[0].node_id  # means nothing
         pose = Rigid3.identity()
-        prior = Hypothesis(state, odom_from_cam, state, probability, node_id, pose, None)
+        prior = MotionHypothesis(state, odom_from_cam, state, probability, node_id, pose, None)
         self._stream = MapStream(self._stream.localizer, self.config, prior)
 
     def process_missing(

@@ -24,7 +24,7 @@ from topoloc.localization.exact.appearance import load_appearance_weights
 from topoloc.localization.query import Deadline
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.retrieval.coarse import Image
-from topoloc.slam.pose_graph import Edge, optimize_pose_graph
+from topoloc.slam.pose_graph import PoseGraphEdge, optimize_pose_graph
 from topoloc.tracking.motion import MotionState
 from topoloc.tracking.point_tracker import PointTracker, TrackedMotion
 
@@ -207,11 +207,11 @@ class PoseWindow:
         before = self._smoothed[-1] if self._smoothed else None
         self._smoothed.append(cam_from_world if before is None else cam_from_before @ before)
         self._measured.append(((cam_from_world, covariance), (cam_from_before, motion_covariance)))
-        edges = list[Edge]()
+        edges = list[PoseGraphEdge]()
         for k, (pose, motion) in enumerate(self._measured, start=1):
-            edges.append(Edge(0, k, *pose, is_loop=True))
+            edges.append(PoseGraphEdge(0, k, *pose, is_loop=True))
             if k > 1:
-                edges.append(Edge(k - 1, k, *motion, is_loop=True))
+                edges.append(PoseGraphEdge(k - 1, k, *motion, is_loop=True))
         poses = optimize_pose_graph(
             [Rigid3.identity(), *self._smoothed], edges, max_steps=5, min_step=1e-4
         )

@@ -31,7 +31,7 @@ def test_what_config_prints_is_read_back_as_the_defaults(
     read = read_settings(file_of(printed))
     for name in all_tables():
         assert tables[name]
-        assert read.of(config_class(name)) == config_class(name)()
+        assert read.get(config_class(name)) == config_class(name)()
 
 
 def test_a_command_can_be_named(capsys: pytest.CaptureFixture[str]):

@@ -92,10 +92,10 @@ def test_a_part_of_a_table_changes_that_part_alone(file_of: FileOf):
     read = read_settings(
         file_of('[cart]\nname = "Ox"\nloads = [[0, 1], [2, 3.5]]\nfront = {radius = 2}')
     )
-    assert read.of(Cart) == Cart(Wheel(2.0), "Ox", loads=((0.0, 1.0), (2.0, 3.5)))
-    assert isinstance(read.of(Cart).front.radius, float)
-    assert read_settings(file_of("[cart]\nfront = {}")).of(Cart).front == Wheel(0.5)
-    assert read.of(Wheel) == read_settings(None).of(Wheel) == Wheel()
+    assert read.get(Cart) == Cart(Wheel(2.0), "Ox", loads=((0.0, 1.0), (2.0, 3.5)))
+    assert isinstance(read.get(Cart).front.radius, float)
+    assert read_settings(file_of("[cart]\nfront = {}")).get(Cart).front == Wheel(0.5)
+    assert read.get(Wheel) == read_settings(None).get(Wheel) == Wheel()
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def piece(queried_map: Path) -> Piece:
     """Return all images of the room as one piece that is sent to a machine."""
     topomap = TopoMetricMap.load(queried_map / "room.topo")
     recording = QueryRecording(str(queried_map / "pictures"), label="walk")
-    sent = RemoteMap.of(Localizer(topomap), "", None)
+    sent = RemoteMap.from_localizer(Localizer(topomap), "", None)
     (piece,) = remote_queries._split(sent, recording, recording.open())
     return piece
 

@@ -74,9 +74,9 @@ def test_what_cannot_be_split_is_said(long_walk: Path, tmp_path: Path):
             main(["build", str(long_walk), str(tmp_path / "a"), "--ray", "local", "--split", text])
             == 2
         )
-    assert SplitOptions.of("600") == SplitOptions(600, 60)
-    assert SplitOptions.of("12") == SplitOptions(12, 3)
-    assert SplitOptions.of("600,90") == SplitOptions(600, 90)
+    assert SplitOptions.parse("600") == SplitOptions(600, 60)
+    assert SplitOptions.parse("12") == SplitOptions(12, 3)
+    assert SplitOptions.parse("600,90") == SplitOptions(600, 90)
 
 
 def _built(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:

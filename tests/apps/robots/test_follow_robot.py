@@ -132,14 +132,15 @@ def test_a_bag_that_begins_again_is_followed_on(robot: PlayedRobot, room_map: Pa
 
 
 def test_without_odometry_tf_is_that_of_the_camera(robot: PlayedRobot, room_map: Path):
-    with followed(room_map, DOMAIN, "--ros", "--odom", "none", "--camera", "map"):
+    names = ("--odom", "none", "--camera-frame", "front")
+    with followed(room_map, DOMAIN, "--ros", *names, "--camera", "map"):
         steps = _drive(1.0, 2.0)
         _start(robot, steps[0])
         robot.play(steps)
     assert robot.heard.transforms == []
     child, stamp, pose = robot.heard.others[-1]
     camera = robot.world_from_cam(stamp)
-    assert child == "topoloc_camera"
+    assert child == "front"
     assert np.linalg.norm(pose.translation - camera.translation) < 0.05
     assert np.allclose(robot.heard.poses[-1][2].matrix(), pose.matrix(), atol=1e-9)
     assert np.linalg.norm(BASE_FROM_CAM.translation) > 0.4  # it is not the robot's

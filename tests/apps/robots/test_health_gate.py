@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from topoloc.apps.robots.config import RobotConfig
-from topoloc.apps.robots.map_to_odom import Evidence, HealthGate
+from topoloc.apps.robots.map_to_odom import HealthGate, MeasuredPose
 from topoloc.geometry.rigid import Rigid3
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
@@ -19,7 +18,7 @@ AWAY = Rigid3.exp(np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.1]))
 
 def _evidence(
     t_s: float, wrong: Rigid3 | None = None, is_localized: bool = True, drift: float = 0.0
-) -> Evidence:
+) -> MeasuredPose:
     """Return evidence at a time. The robot drives 0.5 m/s, and its odometry is off by
     `drift` metres."""
     way = 0.5 * t_s
@@ -27,23 +26,23 @@ def _evidence(
     truth = MAP_FROM_ODOM @ Rigid3.exp(np.array([way, 0.0, 0.3, 0.0, 0.0, 0.0]))
     pose = truth if wrong is None else wrong @ truth
     travelled = np.array([abs(way), 0.0])
-    return Evidence(round(t_s * 1e9), pose, COVARIANCE, odom_from_cam, travelled, is_localized)
+    return MeasuredPose(round(t_s * 1e9), pose, COVARIANCE, odom_from_cam, travelled, is_localized)
 
 
-def _verdicts(gate: HealthGate, evidence: Sequence[Evidence]) -> str:
+def _verdicts(gate: HealthGate, evidence: Sequence[MeasuredPose]) -> str:
     return "".join(gate.judge(one)[0] for one in evidence)
 
 
 @pytest.fixture
 def gate() -> HealthGate:
     """Return a gate that localized the robot within the first half second."""
-    gate = HealthGate(RobotConfig())
+    gate = HealthGate()
     assert _verdicts(gate, [_evidence(0.2 * k) for k in range(3)]) == "ddj"
     return gate
 
 
 def test_the_first_pose_needs_several_images_that_agree():
-    gate = HealthGate(RobotConfig(confirm_images=4))
+    gate = HealthGate(num_confirming=4)
     assert _verdicts(gate, [_evidence(0.1), _evidence(0.2, AWAY), _evidence(0.3)]) == "ddd"
     assert gate.agreed is None
     assert _verdicts(gate, [_evidence(0.1 * k) for k in range(4, 8)]) == "ddjf"
@@ -51,7 +50,7 @@ def test_the_first_pose_needs_several_images_that_agree():
 
 def test_tracked_points_confirm_no_new_place():
     """Tracked points share the errors of the wrongly localized image."""
-    gate = HealthGate(RobotConfig())
+    gate = HealthGate()
     tracked = [_evidence(0.1 * k, is_localized=False) for k in range(20)]
     assert set(_verdicts(gate, [_evidence(0.0), *tracked])) == {"d"}
 
@@ -106,14 +105,14 @@ def test_images_that_odometry_contradicts_confirm_no_jump(gate: HealthGate):
 def test_after_a_long_way_in_the_dark_the_drift_is_no_jump(gate: HealthGate):
     """After 20 metres with a drift of five per cent, one metre is one sigma."""
     assert _verdicts(gate, [_evidence(40.0, drift=1.0)]) == "f"
-    assert _verdicts(HealthGate(RobotConfig()), [_evidence(40.0, drift=1.0)]) == "d"
+    assert _verdicts(HealthGate(), [_evidence(40.0, drift=1.0)]) == "d"
 
 
 def test_a_pose_of_the_user_confirms_the_next_image(gate: HealthGate):
     prior = _evidence(1.0, AWAY)
     rough = np.diag([0.25, 0.25, 0.01, 0.01, 0.01, 0.07])
     moved = Rigid3.exp(np.array([0.3, -0.2, 0.0, 0.0, 0.0, 0.1])) @ prior.map_from_cam
-    given = Evidence(
+    given = MeasuredPose(
         prior.t_ns, moved, rough, prior.odom_from_cam, prior.travelled, is_localized=False
     )
     gate.expect(given)

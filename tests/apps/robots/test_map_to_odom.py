@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.map_to_odom import MapToOdom, project_to_plane, tilt
 from topoloc.geometry.rigid import Rigid3
 
@@ -21,7 +20,7 @@ def _moved(xi: list[float]) -> Rigid3:
 def test_corrections_move_the_robot_no_faster_than_allowed():
     """The robot is 20 m from the origin of odom and is corrected by 10 cm and 0.1 rad. A rotation
     about that origin would move it by two metres."""
-    followed = MapToOdom(RobotConfig(correction_speed=0.2, correction_turn=0.5))
+    followed = MapToOdom(speed=0.2, turn_rate=0.5)
     assert followed.advance(5.0) is None
     followed.set_target(ODOM_FROM_BASE, ODOM_FROM_BASE, at_once=False)
     first = followed.advance(5.1)
@@ -40,7 +39,7 @@ def test_corrections_move_the_robot_no_faster_than_allowed():
 
 
 def test_a_jump_can_be_at_once():
-    followed = MapToOdom(RobotConfig())
+    followed = MapToOdom()
     followed.set_target(ODOM_FROM_BASE, ODOM_FROM_BASE, at_once=False)
     followed.advance(1.0)
     target = _moved([3.0, 0.0, 0.0, 0.0, 0.0, 1.0])

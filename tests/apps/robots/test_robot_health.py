@@ -6,31 +6,29 @@ import time
 
 import pytest
 
-from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.robot_health import Health, RobotClock
 
 
 def test_levels_follow_the_evidence():
-    config = RobotConfig(warn_after=1.0, lost_after=10.0)
     health = Health()
-    assert health.judge(100.0, config) == (2, "not localized yet")
+    assert health.judge(100.0) == (2, "not localized yet")
     health.evidence_at = 100.0
-    assert health.judge(100.5, config) == (0, "localized")
+    assert health.judge(100.5) == (0, "localized")
     health.is_contradicted = True
-    assert health.judge(100.5, config) == (1, "the images contradict the pose")
+    assert health.judge(100.5) == (1, "the images contradict the pose")
     health.is_contradicted = False
-    assert health.judge(102.0, config) == (1, "no evidence for 2.0 s; the pose is that of odometry")
-    assert health.judge(111.0, config) == (2, "lost: no evidence for 11.0 s")
+    assert health.judge(102.0) == (1, "no evidence for 2.0 s; the pose is that of odometry")
+    assert health.judge(111.0) == (2, "lost: no evidence for 11.0 s")
 
 
 def test_a_fault_is_named_as_long_as_it_lasts():
-    config, health = RobotConfig(), Health()
+    health = Health()
     health.faults["tf"] = "TF loops"
-    assert health.judge(0.0, config) == (2, "TF loops")
+    assert health.judge(0.0) == (2, "TF loops")
     health.evidence_at = 0.0
-    assert health.judge(0.1, config) == (1, "TF loops")
+    assert health.judge(0.1) == (1, "TF loops")
     health.faults.clear()
-    assert health.judge(0.1, config) == (0, "localized")
+    assert health.judge(0.1) == (0, "localized")
 
 
 def test_slow_answers_are_no_other_clock():
@@ -58,7 +56,7 @@ def test_another_clock_is_named_and_followed(offset: float, side: str):
 def test_simulated_time_that_does_not_come_is_a_fault():
     clock = RobotClock(is_simulated=True)
     assert clock.describe_fault() == (
-        "no time on /clock; start the simulation, or set use_sim_time = false"
+        "no time on /clock; start the simulation, or leave out use_sim_time"
     )
     clock.set_simulated(5_000_000_000)
     assert clock.describe_fault() is None

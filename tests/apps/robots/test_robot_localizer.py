@@ -177,10 +177,10 @@ def test_map_to_odom_is_that_of_the_measured_poses(make: Callable[..., Robot]):
 
 
 def test_it_is_published_between_the_images_with_stamps_that_increase(make: Callable[..., Robot]):
-    robot = make(rate=100.0)
+    robot = make()
     for number in range(4):
         robot.see(number)
-    time.sleep(0.5)
+    time.sleep(0.8)
     stamps = [t_ns for t_ns, _, _ in robot.published.transforms]
     assert len(stamps) > 15
     assert np.diff(stamps).min() > 0
@@ -205,7 +205,7 @@ def test_what_is_no_evidence_is_not_published(make: Callable[..., Robot]):
 
 
 def test_the_gate_holds_after_images_without_tf(make: Callable[..., Robot]):
-    robot = make(tf_wait=0.0)
+    robot = make()
     for number in range(40):
         robot.see(number)
     robot.has_tf = False
@@ -240,14 +240,14 @@ def test_a_map_that_lies_on_its_side_has_no_plane(make: Callable[..., Robot]):
 
 
 def test_missing_tf_is_one_warning_and_an_error_of_diagnostics(make: Callable[..., Robot]):
-    robot = make(tf_wait=0.0, base_frame="base_footprint")
+    robot = make(base_frame="base_footprint")
     for number in range(4):
         robot.see(number)
     (line,) = robot.warnings
     assert "no frame base_footprint in TF" in line
     assert robot.published.poses == []
-    time.sleep(0.2)
-    level, text, values = robot.published.statuses[0]
+    time.sleep(1.2)  # one more status
+    level, text, values = robot.published.statuses[-1]
     assert (level, text, values["state"]) == (2, line, "localized")
 
 
@@ -323,9 +323,8 @@ def test_another_localizer_is_named(make: Callable[..., Robot]):
     assert robot.warnings == ["another node publishes TF to odom; stop it, or name the frames"]
 
 
-@pytest.mark.parametrize("jump", ["at_once", "smooth"])
-def test_after_a_kidnapping_it_moves_at_once_or_smoothly(make: Callable[..., Robot], jump: str):
-    robot = make(jump=jump, correction_speed=0.1)
+def test_after_a_kidnapping_it_moves_at_once(make: Callable[..., Robot]):
+    robot = make()
     for number in range(4):
         robot.see(number)
     away = Rigid3.exp(np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0]))
@@ -333,25 +332,26 @@ def test_after_a_kidnapping_it_moves_at_once_or_smoothly(make: Callable[..., Rob
         robot.see(number, wrong=away)
     _, _, pose = robot.published.transforms[-1]
     moved = np.linalg.norm(pose.translation - MAP_FROM_ODOM.translation)
-    assert moved == pytest.approx(2.0) if jump == "at_once" else moved < 0.5
+    assert moved == pytest.approx(2.0)
     time.sleep(0.3)
     later = robot.published.transforms[-1][2]
-    assert np.linalg.norm(later.translation - MAP_FROM_ODOM.translation) >= moved
+    assert np.linalg.norm(later.translation - MAP_FROM_ODOM.translation) == pytest.approx(moved)
     level, text, values = robot.published.statuses[-1]
     assert (level, text, values["jumps"]) == (0, "localized", "1")
 
 
 def test_without_odometry_each_measured_pose_is_that_of_the_camera(make: Callable[..., Robot]):
-    robot = make(odom_frame="none", confirm_images=1)
+    robot = make(odom_frame="none", camera_frame="front")
     robot.start_ns = 5_000_000_000  # of a recording
-    robot.see(0)
-    robot.see(1, state="predicted", result=NotLocalized("too_few_matches"))
+    for number in range(3):
+        robot.see(number)
+    robot.see(3, state="predicted", result=NotLocalized("too_few_matches"))
     (t_ns, child, pose) = robot.published.transforms[0]
-    assert (t_ns, child, len(robot.published.poses)) == (robot.start_ns, "topoloc_camera", 1)
-    expected = MAP_FROM_ODOM @ BASE_FROM_CAM
+    assert (t_ns, child, len(robot.published.poses)) == (5_200_000_000, "front", 1)
+    expected = MAP_FROM_ODOM @ robot.base(2) @ BASE_FROM_CAM
     assert np.allclose(pose.matrix(), expected.matrix(), atol=1e-9)
     assert "/tf" not in robot.node.heard
-    for number in range(2, 9):
+    for number in range(4, 9):
         robot.see(number)
     assert robot.warnings == []
 

@@ -94,7 +94,7 @@ def training_set_of(topomap: TopoMetricMap) -> TrainingSet:
     images = list(topomap.place_images)
     if not images or len(topomap.summaries) == 0:
         raise EmptyMapError("the map holds no mapping images to learn from")
-    nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    nodes = NodePoses.from_poses([summary.world_from_cam for summary in topomap.summaries])
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
     return TrainingSet(
         jpegs=[image.jpeg for image in images],

@@ -67,7 +67,7 @@ class Command:
             [self.out or (None if tile_id else self.map), self.json, self.checkpoint],
             inputs=[path for path in (self.weights, self.config) if path is not None],
         )
-        config = read_settings(self.config).of(CoarseTrainingConfig)
+        config = read_settings(self.config).get(CoarseTrainingConfig)
         start = time.perf_counter()
         facts, model = place.edit(
             tile_id, lambda path: self._trained(path, Path(self.out or path), config)

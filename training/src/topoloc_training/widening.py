@@ -67,7 +67,7 @@ def _output_of_each_node(
         raise TrainingError(
             f"the map's {NAME} knows none of its nodes; train one without --weights {MAP}"
         )
-    poses = NodePoses.of([topomap.summaries[row].world_from_cam for row in known])
+    poses = NodePoses.from_poses([topomap.summaries[row].world_from_cam for row in known])
     outputs = []
     for summary in topomap.summaries:
         nearest = known[

@@ -57,7 +57,7 @@ class Settings:
     def __init__(self, configs: dict[type, Any]) -> None:
         self._configs = configs
 
-    def of(self, kind: type[T]) -> T:
+    def get(self, kind: type[T]) -> T:
         """Return the configuration of this class."""
         return self._configs[kind] if kind in self._configs else kind()
 

@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from topoloc import Rigid3
-from topoloc.apps.robots.config import RobotConfig
 
 Verdict = Literal["found", "jumped", "doubted"]
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class MeasuredPose:
     """Hold the pose of an image.
 
     Attributes:
@@ -54,13 +53,22 @@ class Evidence:
 
 
 class HealthGate:
-    """Hold the agreed transform from map to odom. `agreed` is its last evidence."""
+    """Hold the agreed transform from map to odom. `agreed` is its last evidence.
 
-    def __init__(self, config: RobotConfig) -> None:
-        self._config = config
-        self.agreed: Evidence | None = None
-        self._against: list[Evidence] = []
-        self._prior: Evidence | None = None
+    Args:
+        num_confirming: localized images that must agree by odometry on a first pose or a jump.
+    """
+
+    min_probability: ClassVar[float] = 0.8
+    """Least probability of a pose that counts as evidence."""
+    odometry_error: ClassVar[float] = 0.05
+    """Error of the odometry, as a share of the way and of the rotation (one sigma)."""
+
+    def __init__(self, num_confirming: int = 3) -> None:
+        self._num_confirming = num_confirming
+        self.agreed: MeasuredPose | None = None
+        self._against: list[MeasuredPose] = []
+        self._prior: MeasuredPose | None = None
 
     @property
     def is_contradicted(self) -> bool:
@@ -72,11 +80,11 @@ class HealthGate:
         self.agreed = self._prior = None
         self._against = []
 
-    def expect(self, prior: Evidence) -> None:
+    def expect(self, prior: MeasuredPose) -> None:
         """Take a pose that a user gave. The next one that agrees with it is confirmed by that."""
         self._prior = prior
 
-    def judge(self, evidence: Evidence) -> Verdict:
+    def judge(self, evidence: MeasuredPose) -> Verdict:
         """Take the pose of an image.
 
         Return "found" if it agrees with the transform, "jumped" if it is the last of several that
@@ -98,21 +106,21 @@ class HealthGate:
 
     def _is_confirmed(self) -> bool:
         first, last = self._against[0], self._against[-1]
-        if len(self._against) < self._config.confirm_images or self.agreed is None:
-            return len(self._against) >= self._config.confirm_images
+        if len(self._against) < self._num_confirming or self.agreed is None:
+            return len(self._against) >= self._num_confirming
         # Images of a robot that stands (metres and radians) have the same errors.
-        still, times_as_long = 0.1, 5.0
+        still, moving_s, standing_s = 0.1, 1.0, 5.0
         is_still = bool(np.all(last.travelled - first.travelled < still))
-        seconds = self._config.confirm_seconds * (times_as_long if is_still else 1.0)
+        seconds = standing_s if is_still else moving_s
         return last.t_ns - first.t_ns >= seconds * 1e9
 
-    def _agree(self, before: Evidence, after: Evidence) -> bool:
+    def _agree(self, before: MeasuredPose, after: MeasuredPose) -> bool:
         """Return whether two poses are the same but for the motion by odometry between them."""
         metres, radians = 0.05, 0.05  # smaller differences are none
         max_surprise = 33.0  # chi^2 of 6 degrees of freedom: 1 in 100,000
         motion = before.odom_from_cam.inverse() @ after.odom_from_cam
         way_and_turn = np.abs(after.travelled - before.travelled)
-        sigmas = self._config.odometry_error * np.repeat(way_and_turn, 3) + 1e-3
+        sigmas = self.odometry_error * np.repeat(way_and_turn, 3) + 1e-3
         to_after = motion.inverse()
         return (before.map_from_cam @ motion).is_same(
             after.map_from_cam,
@@ -165,10 +173,15 @@ def _can_follow(before: tuple[int, Rigid3], after: tuple[int, Rigid3]) -> bool:
 
 
 class MapToOdom:
-    """Hold the published transform, and the one that it moves to."""
+    """Hold the published transform, and the one that it moves to.
 
-    def __init__(self, config: RobotConfig) -> None:
-        self._config = config
+    Args:
+        speed: metres per second by which smooth corrections move the robot.
+        turn_rate: radians per second by which they turn it.
+    """
+
+    def __init__(self, speed: float = 0.5, turn_rate: float = 0.5) -> None:
+        self._speed, self._turn_rate = speed, turn_rate
         self._target: Rigid3 | None = None
         self._published = Rigid3.identity()
         self._odom_from_base, self._last = Rigid3.identity(), 0.0
@@ -193,7 +206,7 @@ class MapToOdom:
         now, then = (one @ self._odom_from_base for one in (self._published, self._target))
         way = float(np.linalg.norm(then.translation - now.translation))
         turn = (now.inverse() @ then).angle()
-        need = max(way / self._config.correction_speed, turn / self._config.correction_turn)
+        need = max(way / self._speed, turn / self._turn_rate)
         if need <= elapsed:
             self._published = self._target
         else:

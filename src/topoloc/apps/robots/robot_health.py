@@ -8,8 +8,6 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
-from topoloc.apps.robots.config import RobotConfig
-
 
 class RobotClock:
     """Hold the time of the stamps.
@@ -55,7 +53,7 @@ class RobotClock:
     def describe_fault(self) -> str | None:
         """Return what is wrong with the clock, in one sentence, or None."""
         if self._is_simulated and not self._simulated_ns:
-            return "no time on /clock; start the simulation, or set use_sim_time = false"
+            return "no time on /clock; start the simulation, or leave out use_sim_time"
         if not self.is_foreign:
             return None
         side = "behind" if self.offset > 0 else "ahead of"
@@ -82,20 +80,21 @@ class Health:
     num_jumps: int = 0
     faults: dict[str, str] = field(default_factory=dict)
 
-    def judge(self, now: float, config: RobotConfig) -> tuple[int, str]:
+    def judge(self, now: float) -> tuple[int, str]:
         """Return the level (0 OK, 1 WARN, 2 ERROR) and a sentence."""
         ok, warn, error = range(3)
+        warn_after, lost_after = 1.0, 10.0  # seconds without evidence
         silence, faults = now - self.evidence_at, tuple(self.faults.values())  # of other threads
         fault = faults[0] if faults else None
         if math.isinf(silence):
             return error, fault or "not localized yet"
-        if silence > config.lost_after:
+        if silence > lost_after:
             return error, fault or f"lost: no evidence for {silence:.1f} s"
         if fault is not None:
             return warn, fault
         if self.is_contradicted:
             return warn, "the images contradict the pose"
-        if silence > config.warn_after:
+        if silence > warn_after:
             return warn, f"no evidence for {silence:.1f} s; the pose is that of odometry"
         return ok, "localized"
 

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,9 +21,9 @@ from topoloc.apps.query_camera import CameraOfSize
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.map_to_odom import (
     ContinuityGate,
-    Evidence,
     HealthGate,
     MapToOdom,
+    MeasuredPose,
     project_to_plane,
     tilt,
 )
@@ -34,7 +34,7 @@ from topoloc.apps.robots.transform_buffer import TransformBuffer, TransformError
 
 
 @dataclass(frozen=True, eq=False)
-class Odometry:
+class OdometryPose:
     """Hold the pose of the camera in odom and on the robot at the time of an image, and the way and
     the rotation so far."""
 
@@ -53,6 +53,11 @@ class RobotLocalizer:
         map_from_world: the robot's map in which the poses are; z points up in it.
     """
 
+    rate: ClassVar[float] = 20.0
+    """Transforms per second, between the images too."""
+    transform_tolerance: ClassVar[float] = 0.2
+    """Seconds by which transforms are stamped ahead."""
+
     def __init__(
         self,
         node: RosNode,
@@ -63,11 +68,11 @@ class RobotLocalizer:
     ) -> None:
         self._config, self._images, self._warn = config, images, warn
         self._map_from_world = map_from_world or Rigid3.identity()
-        self._clock = RobotClock(config.use_sim_time, config.clock_offset)
-        self._transforms, self._gate = TransformBuffer(), HealthGate(config)
-        self._camera_gate = ContinuityGate(config.confirm_images)  # without odometry
-        self._map_to_odom, self._health = MapToOdom(config), Health()
-        self._odometry: Odometry | None = None  # of the last image that had one
+        self._clock = RobotClock(config.use_sim_time)
+        self._transforms, self._gate = TransformBuffer(), HealthGate()
+        self._camera_gate = ContinuityGate()  # without odometry
+        self._map_to_odom, self._health = MapToOdom(), Health()
+        self._odometry: OdometryPose | None = None  # of the last image that had one
         self._user_pose: Any = None
         self._last_ns = self._last_stamp_ns = 0
         self._rival_at = -math.inf  # when another node published map to odom
@@ -143,13 +148,13 @@ class RobotLocalizer:
         """Start again, because the clock was set back."""
         with self._lock:
             self._gate.reset()
-            self._camera_gate = ContinuityGate(self._config.confirm_images)
+            self._camera_gate = ContinuityGate()
             self._map_to_odom.reset()
             self._transforms.forget_after(t_ns)
             self._clock.reset()
             self._odometry, self._last_stamp_ns = None, 0
 
-    def _find_odometry(self, t_ns: int) -> Odometry | None:
+    def _find_odometry(self, t_ns: int) -> OdometryPose | None:
         """Return the odometry at the time of an image, None if there is none."""
         config, before = self._config, self._odometry
         if not config.has_odometry:
@@ -161,9 +166,10 @@ class RobotLocalizer:
         is_rival = time.monotonic() - self._rival_at < seconds
         self._report("rival", text if is_rival else None)
         camera = (self._images and self._images.frame_id) or config.camera_frame
+        patience = 0.1  # seconds for the transforms at the time of the image
         try:
             odom_from_cam, base_from_cam = (
-                self._transforms.look_up(target, camera, t_ns, config.tf_wait)
+                self._transforms.look_up(target, camera, t_ns, patience)
                 for target in (config.odom_frame, config.base_frame)
             )
         except TransformError as error:
@@ -175,10 +181,10 @@ class RobotLocalizer:
             motion = before.odom_from_cam.inverse() @ odom_from_cam
             step = np.array([np.linalg.norm(motion.translation), motion.angle()])
             travelled = before.travelled + step
-        self._odometry = Odometry(odom_from_cam, base_from_cam, travelled)
+        self._odometry = OdometryPose(odom_from_cam, base_from_cam, travelled)
         return self._odometry
 
-    def _take_prior(self, t_ns: int, odometry: Odometry) -> Uncertain | None:
+    def _take_prior(self, t_ns: int, odometry: OdometryPose) -> Uncertain | None:
         """Return world_from_cam that a user gave since the last image, if any."""
         message, self._user_pose = self._user_pose, None
         if message is None:
@@ -195,13 +201,13 @@ class RobotLocalizer:
         self._gate.expect(_make_evidence(t_ns, (pose, covariance), odometry))
         return world_from_map @ pose, world_from_map.transform_covariance(covariance)
 
-    def _publish(self, answer: StreamedPose, odometry: Odometry | None) -> None:
+    def _publish(self, answer: StreamedPose, odometry: OdometryPose | None) -> None:
         """Publish the pose of an image if it is evidence and the gate agrees."""
         health = self._health
         pose, health.probability = self._measured_pose(answer)
         health.state = answer.state
         health.num_dropped = 0 if self._images is None else self._images.num_dropped
-        if pose is not None and health.probability >= self._config.min_probability:
+        if pose is not None and health.probability >= self._gate.min_probability:
             if not self._config.has_odometry:
                 if self._camera_gate.judge(answer.t_ns, pose[0]) != "doubted":
                     self._publish_camera(answer.t_ns, *pose)
@@ -231,7 +237,7 @@ class RobotLocalizer:
         self._publisher.send_transform(t_ns, self._config.camera_frame, map_from_cam)
         self._publisher.send_pose(t_ns, map_from_cam, covariance)
 
-    def _judge(self, evidence: Evidence, odometry: Odometry) -> None:
+    def _judge(self, evidence: MeasuredPose, odometry: OdometryPose) -> None:
         """Ask the gate about a pose, and publish it if it agrees."""
         is_first, verdict = self._gate.agreed is None, self._gate.judge(evidence)
         if verdict == "doubted":
@@ -245,9 +251,8 @@ class RobotLocalizer:
             self._check_tilt(map_from_base)
             map_from_base = project_to_plane(map_from_base)
             odom_from_base = project_to_plane(odom_from_base)
-        is_at_once = verdict == "jumped" and self._config.jump == "at_once"
         with self._lock:
-            self._map_to_odom.set_target(map_from_base, odom_from_base, is_at_once)
+            self._map_to_odom.set_target(map_from_base, odom_from_base, verdict == "jumped")
         self._send_map_to_odom()
         self._publisher.send_pose(evidence.t_ns, map_from_base, evidence.covariance)
 
@@ -261,7 +266,7 @@ class RobotLocalizer:
 
     def _send_map_to_odom(self) -> None:
         """Publish the transform, stamped ahead. Its stamps increase, unless the clock is set."""
-        ahead_ns, set_ns = round(1e9 * self._config.transform_tolerance), 1_000_000_000
+        ahead_ns, set_ns = round(1e9 * self.transform_tolerance), 1_000_000_000
         with self._lock:
             map_from_odom = self._map_to_odom.advance(time.monotonic())
             stamp_ns = self._clock.now_ns() + ahead_ns
@@ -274,10 +279,10 @@ class RobotLocalizer:
     def _repeat(self) -> None:
         """Publish the transform and the diagnostics again and again; runs in the thread."""
         interval, due, before = 1.0, 0.0, None  # seconds between diagnostics of one level
-        while not self._is_closed.wait(1.0 / self._config.rate):
+        while not self._is_closed.wait(1.0 / self.rate):
             self._send_map_to_odom()
             now = time.monotonic()
-            level, text = self._health.judge(now, self._config)
+            level, text = self._health.judge(now)
             if now >= due or level != before:
                 due, before = now + interval, level
                 values = self._health.values(now, self._clock.offset)
@@ -295,6 +300,6 @@ class RobotLocalizer:
 
 
 def _make_evidence(
-    t_ns: int, pose: Uncertain, odometry: Odometry, is_localized: bool = False
-) -> Evidence:
-    return Evidence(t_ns, *pose, odometry.odom_from_cam, odometry.travelled, is_localized)
+    t_ns: int, pose: Uncertain, odometry: OdometryPose, is_localized: bool = False
+) -> MeasuredPose:
+    return MeasuredPose(t_ns, *pose, odometry.odom_from_cam, odometry.travelled, is_localized)

@@ -138,7 +138,7 @@ class TransformBuffer:
             if frame not in known:
                 has = f"; TF has {', '.join(sorted(known)[:8])}" if known else "; TF is empty"
                 return (
-                    f"no frame {frame} in TF{has}; name the frames in --config, table robot, or"
-                    " give --odom none"
+                    f"no frame {frame} in TF{has}; name the frames (--base-frame, --odom,"
+                    " --camera-frame), or give --odom none"
                 )
         return f"TF does not connect {target} to {source}; start the node that publishes the rest"

@@ -195,7 +195,7 @@ class QueryHandler:
         picture = query_request.picture
         image, size = self.decoder.decode(picture)
         camera = parse_camera_field(query_request.camera, picture, size, topomap)
-        return image, fit_camera(camera, size, image)
+        return image, adapt_camera(camera, size, image)
 
     def _run_query(
         self,
@@ -251,7 +251,7 @@ class ImageDecoder:
                 self._condition.notify_all()
 
 
-def fit_camera(
+def adapt_camera(
     camera: Camera | UncalibratedCamera, size: tuple[int, int], image: Image
 ) -> Camera | UncalibratedCamera:
     """Return the camera of an image of this width and height for the image as it was decoded."""

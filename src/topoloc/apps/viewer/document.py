@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from topoloc import Camera, Rigid3, TopoMetricMap, read_image
 from topoloc.apps.core_names import encode_jpeg
-from topoloc.apps.viewer.map_scene import sample_colours, unique_image_names
+from topoloc.apps.viewer.map_scene import sample_node_colours, unique_image_names
 from topoloc.plugin import EncodedImage
 
 GAP_STEPS = 6.0
@@ -126,7 +126,9 @@ def _read_nodes(
         steps = np.linspace(0, len(rows), int(share * len(rows)), endpoint=False)
         chosen = rows[steps.astype(np.int64)]
         points.append(node.summary.world_from_cam.apply(node.points_cam[chosen].astype(np.float64)))
-        colours.append(sample_colours(node, node.features.points_img[chosen].astype(np.float64)))
+        colours.append(
+            sample_node_colours(node, node.features.points_img[chosen].astype(np.float64))
+        )
         cameras.append(node.camera)
         images.append(node.template_image)
     rgb = np.concatenate(colours).round().astype(np.uint8)

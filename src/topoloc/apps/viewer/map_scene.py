@@ -25,7 +25,7 @@ _MIN_SIGMA = 1e-4  # metres; no map is more precise
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks:
+class KeyPointTable:
     """Point k lies at `points_world[k]` (metres).
 
     Key point i of all nodes, in their order, shows the point `point_rows[i]`, -1 if it agrees with
@@ -39,7 +39,7 @@ class Tracks:
 
 def find_tracks(
     topomap: TopoMetricMap, rows: list[int], progress: Progress | None = None
-) -> Tracks:
+) -> KeyPointTable:
     """Find the tracks through these nodes. Raises MapError if a node cannot be read."""
     nodes = [topomap.nodes[row] for row in rows]
     counts = [len(node.points_cam) for node in nodes]
@@ -101,7 +101,7 @@ class _KeyPoints:
     translations: Float[np.ndarray, "m 3"]
 
     @staticmethod
-    def of(nodes: list[TopoNode], labels: Int[np.ndarray, " m"]) -> _KeyPoints:
+    def from_nodes(nodes: list[TopoNode], labels: Int[np.ndarray, " m"]) -> _KeyPoints:
         counts = [len(node.points_cam) for node in nodes]
         poses = [node.summary.world_from_cam.inverse() for node in nodes]
         sides = np.array([max(node.camera.width, node.camera.height) for node in nodes], np.float64)
@@ -130,11 +130,13 @@ class _KeyPoints:
         return (points_cam[:, :2] / z[:, None] - self.normalized) * self.focals[:, None], points_cam
 
 
-def _triangulate_tracks(labels: Int[np.ndarray, " m"], matchers: list[NodeMatcher]) -> Tracks:
+def _triangulate_tracks(
+    labels: Int[np.ndarray, " m"], matchers: list[NodeMatcher]
+) -> KeyPointTable:
     """Fit the point of each track to its nodes' points, by their covariances, and to its key
     points."""
     nodes = [matcher.node for matcher in matchers]
-    num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.of(nodes, labels)
+    num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.from_nodes(nodes, labels)
     prior, pull = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
     covariances = np.concatenate([part.covariances for part in matchers])
     points_world = np.concatenate([part.points_world for part in matchers])
@@ -149,7 +151,7 @@ def _triangulate_tracks(labels: Int[np.ndarray, " m"], matchers: list[NodeMatche
     of_kept, places = np.unique(labels[kept], return_inverse=True)
     point_rows = np.full(len(labels), -1, np.int64)
     point_rows[kept] = places
-    return Tracks(points[of_kept], point_rows, errors)
+    return KeyPointTable(points[of_kept], point_rows, errors)
 
 
 def _gauss_newton_step(
@@ -210,7 +212,7 @@ def create_map_scene(
             replace(view, points_img=its_pixels, point_rows=its_rows)
             for view, its_pixels, its_rows in zip(views, pixels, rows_of, strict=True)
         ]
-        colours = [sample_colours(*pair) for pair in zip(nodes, pixels, strict=True)]
+        colours = [sample_node_colours(*pair) for pair in zip(nodes, pixels, strict=True)]
         points = _to_scene_points(tracks, np.concatenate(colours))
     trajectory = [
         image.world_from_cam for image in topomap.place_images if is_shown(image.session_id)
@@ -241,7 +243,7 @@ def unique_image_names(topomap: TopoMetricMap) -> list[str]:
     return [f"session{summary.session_id}/{summary.name}" for summary in topomap.summaries]
 
 
-def _to_scene_points(tracks: Tracks, sampled_rgb: Float[np.ndarray, "m 3"]) -> Points:
+def _to_scene_points(tracks: KeyPointTable, sampled_rgb: Float[np.ndarray, "m 3"]) -> Points:
     """Average colour and error of each point over the images that show it."""
     shown = tracks.point_rows >= 0
     rows, num_points = tracks.point_rows[shown], len(tracks.points_world)
@@ -253,7 +255,9 @@ def _to_scene_points(tracks: Tracks, sampled_rgb: Float[np.ndarray, "m 3"]) -> P
     return Points(tracks.points_world, colours, errors / counts)
 
 
-def sample_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
+def sample_node_colours(
+    node: TopoNode, pixels: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, "m 3"]:
     """Return the colours of the node's image at pixels of its camera, RGB, 0 to 255. They are black
     without an image. Raises MapError: the image is damaged."""
     picture = read_node_rgb(node)

@@ -98,7 +98,7 @@ class CameraPrior:
     stated: tuple[float, float]
     usual: tuple[float, float]
 
-    def of(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
+    def moments(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
         """Return mean and covariance of the parameters under a hypothesis."""
         focal = self.stated if hypothesis.is_focal_stated else self.usual
         mean, priors = unchanged_camera(), _priors()
@@ -123,7 +123,7 @@ class CameraPrior:
     def hypotheses(self) -> list[CameraHypothesis]:
         """Return the hypotheses that differ."""
         focal, odds = (True,) if self.stated == self.usual else (True, False), _priors()
-        return [CameraHypothesis(*one) for one in product(focal, odds.off_centre, odds.lens)]
+        return [CameraHypothesis(*values) for values in product(focal, odds.off_centre, odds.lens)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,26 +174,27 @@ class CameraBelief:
 
     @property
     def _chosen(self) -> WeighedCamera:
-        return next(one for one in self.weighed if one.hypothesis == self.reported)
+        return next(camera for camera in self.weighed if camera.hypothesis == self.reported)
 
     @cached_property
     def covariance(self) -> Float[np.ndarray, "6 6"]:
         """Return the covariance that the camera adds to the pose: under the reported hypothesis, or
         under all of them if the residuals contradict it."""
         counted = self.weighed if self.is_contradicted else [self._chosen]
-        total = sum(one.probability for one in counted)
+        total = sum(camera.probability for camera in counted)
         parts = [
-            one.probability * (one.covariance + np.outer(one.shift, one.shift)) for one in counted
+            camera.probability * (camera.covariance + np.outer(camera.shift, camera.shift))
+            for camera in counted
         ]
         return np.sum(parts, axis=0) / total
 
     def probability_within(self, metres: float, radians: float) -> float:
         """Return the probability that the camera moves the pose by less than both tolerances."""
         return sum(
-            one.probability
-            * _probability_below(metres, one.shift[:3], one.covariance[:3, :3])
-            * _probability_below(radians, one.shift[3:], one.covariance[3:, 3:])
-            for one in self.weighed
+            camera.probability
+            * _probability_below(metres, camera.shift[:3], camera.covariance[:3, :3])
+            * _probability_below(radians, camera.shift[3:], camera.covariance[3:, 3:])
+            for camera in self.weighed
         )
 
 

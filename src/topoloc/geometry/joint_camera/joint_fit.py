@@ -39,7 +39,7 @@ _NUM_ROUNDS = 15
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class CameraObservations:
     """Hold n pixels on the plane z = 1 of a first camera (standard deviation `sigma`), and the
     world points (metres) with covariances (m^2) that they show. `cells` are parts of the image,
     within which errors may be shared."""
@@ -117,7 +117,7 @@ class JointFit:
 
 
 def fit_jointly(
-    seen: Observations,
+    seen: CameraObservations,
     cam_from_world: Rigid3,
     camera: Vector,
     prior: tuple[Vector, Matrix],
@@ -151,19 +151,21 @@ def fit_jointly(
 
 
 def fit_camera(
-    seen: Observations, cam_from_world: Rigid3, camera: Vector, prior: CameraPrior
+    seen: CameraObservations, cam_from_world: Rigid3, camera: Vector, prior: CameraPrior
 ) -> JointFit | None:
     """Fit pose and all camera parameters. Radial distortion comes first, because from far away the
     other terms lead astray. None if the observations do not fix the pose."""
     wide = CameraHypothesis(False, "xy", "radial")
-    fit = fit_jointly(seen, cam_from_world, camera, prior.of(wide), wide.basis)
+    fit = fit_jointly(seen, cam_from_world, camera, prior.moments(wide), wide.basis)
     if fit is None:
         return None
     wide = CameraHypothesis(False, "xy", "other")
-    return fit_jointly(seen, fit.cam_from_world, fit.camera, prior.of(wide), wide.basis)
+    return fit_jointly(seen, fit.cam_from_world, fit.camera, prior.moments(wide), wide.basis)
 
 
-def linearized_fit(seen: Observations, cam_from_world: Rigid3, camera: Vector) -> JointFit | None:
+def linearized_fit(
+    seen: CameraObservations, cam_from_world: Rigid3, camera: Vector
+) -> JointFit | None:
     """Return what the observations show of pose and camera, linearized at these. None if they do
     not fix the pose."""
     system = _linear_system(seen, cam_from_world, camera, None)
@@ -183,7 +185,7 @@ def linearized_fit(seen: Observations, cam_from_world: Rigid3, camera: Vector) -
 
 
 def _linear_system(
-    seen: Observations,
+    seen: CameraObservations,
     cam_from_world: Rigid3,
     camera: Vector,
     active: Bool[np.ndarray, " n"] | None,
@@ -231,9 +233,9 @@ def weigh_cameras(
     """Return the probability of each hypothesis, and the parameters' mean and covariance under
     it."""
     hypotheses = prior.hypotheses
-    means, covariances = map(np.array, zip(*map(prior.of, hypotheses), strict=True))
+    means, covariances = map(np.array, zip(*map(prior.moments, hypotheses), strict=True))
     evidence, estimates, posteriors = seen.posteriors(means, covariances)
-    logs = evidence + [one.log_prior for one in hypotheses]
+    logs = evidence + [hypothesis.log_prior for hypothesis in hypotheses]
     shares = np.exp(logs - logs.max())
     found = zip((shares / shares.sum()).tolist(), estimates, posteriors, strict=True)
     return dict(zip(hypotheses, found, strict=True))
@@ -248,8 +250,11 @@ def weigh_poses(
     by_camera = fit.pose_by_camera
     parts = [
         WeighedCamera(
-            one, share, by_camera @ (mean - reported[1]), by_camera @ covariance @ by_camera.T
+            hypothesis,
+            share,
+            by_camera @ (mean - reported[1]),
+            by_camera @ covariance @ by_camera.T,
         )
-        for one, (share, mean, covariance) in weighed.items()
+        for hypothesis, (share, mean, covariance) in weighed.items()
     ]
     return CameraBelief(reported[0], parts)

@@ -47,10 +47,10 @@ def find_tile_of_recording(
         if isinstance(result, Localization):
             answers.append(result)
         progress("which tile", done + 1, len(rows))
-    return select_tile(sequence.name, len(rows), answers, atlas.manifest.by_id)
+    return find_best_tile(sequence.name, len(rows), answers, atlas.manifest.by_id)
 
 
-def select_tile(
+def find_best_tile(
     name: str, num_asked: int, answers: Sequence[Localization], tiles: Mapping[str, Tile]
 ) -> Tile:
     """Return the tile (of `tiles`, by id) with the most localizations (`answers`) of the

@@ -90,7 +90,9 @@ def build_map(
             check_poses(sequence)
     for note in check_common_world(given) if are_poses_checked else []:
         warn(note)
-    return with_map_statistics(build.build_map(sequences, config, progress, poses_from), progress)
+    return with_map_statistics(
+        build.build_node_map(sequences, config, progress, poses_from), progress
+    )
 
 
 def with_map_statistics(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:

@@ -138,7 +138,7 @@ def drop_kept_files(path: Path, newest: Path) -> Sequence[Path]:
     return used
 
 
-def select_kept(files: Sequence[T], sizes: Sequence[int]) -> Sequence[T]:
+def select_kept(files: Sequence[Path], sizes: Sequence[int]) -> Sequence[Path]:
     """Return those of the files, the newest first, that have at most `_MAX_BYTES` together. The
     newest is kept at any size."""
     return files[: max(1, sum(total <= _MAX_BYTES for total in accumulate(sizes)))]

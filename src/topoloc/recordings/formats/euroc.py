@@ -36,7 +36,7 @@ _TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor:
+class SensorFile:
     """Hold the camera model and mounting of one sensor.yaml."""
 
     camera: Camera
@@ -87,14 +87,16 @@ def open_euroc(path: Path, calibration: CalibrationForSize | None = None) -> Rec
 
 def _read_sensors(
     mav: Path, images: list[Path], calibration: CalibrationForSize | None
-) -> tuple[Sensor, StereoRig | None, tuple[str, ...]]:
+) -> tuple[SensorFile, StereoRig | None, tuple[str, ...]]:
     """Return the left sensor, the rig of a pair, and notes."""
     files = [mav / f"cam{number}" / "sensor.yaml" for number in (0, 1)]
     is_pair, has_sensors = (mav / "cam1" / "data.csv").is_file(), files[0].is_file()
     if not has_sensors:
         folders = [folder for folder in (mav.parent, mav.parent / "dso") if folder.is_dir()]
         found = (find_calibration(folder) for folder in folders)
-        calibration = calibration or next((one for one in found if one), None)
+        calibration = calibration or next(
+            (calibration_file for calibration_file in found if calibration_file), None
+        )
     given = calibration and calibration(*first_image_size(images))
     if given is None or has_sensors:
         sensor = read_sensor(files[0])
@@ -109,10 +111,10 @@ def _read_sensors(
     has_truth = any((mav / name / "data.csv").is_file() for name in _TRUTH_FOLDERS)
     note = f"{mav}: no sensor.yaml and no T_cam_imu: the poses of the body are used as the camera's"
     notes = (note,) if mounting is None and has_truth else ()
-    return Sensor(given.camera, mounting or Rigid3.identity()), rig, notes
+    return SensorFile(given.camera, mounting or Rigid3.identity()), rig, notes
 
 
-def read_sensor(path: Path) -> Sensor:
+def read_sensor(path: Path) -> SensorFile:
     """Read the camera model and mounting of a sensor.yaml.
 
     Raises:
@@ -122,10 +124,10 @@ def read_sensor(path: Path) -> Sensor:
     camera = kalibr_camera(path, text)
     mounting = np.array(require_numbers(path, text, 16, "T_BS")).reshape(4, 4)
     with CalibrationError.at(path, TrajectoryError):
-        return Sensor(camera, Rigid3.from_matrix(mounting))
+        return SensorFile(camera, Rigid3.from_matrix(mounting))
 
 
-def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
+def _rig(mav: Path, left: SensorFile, right: SensorFile) -> StereoRig:
     right_from_left = right.body_from_cam.inverse() @ left.body_from_cam
     try:
         return StereoRig(left.camera, right.camera, right_from_left)
@@ -141,7 +143,7 @@ def _read_csv(path: Path) -> tuple[list[int], list[Path]]:
     return t_ns, [path.parent / "data" / name for name in names]
 
 
-def _read_ground_truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
+def _read_ground_truth(mav: Path, t_ns: list[int], sensor: SensorFile) -> list[Rigid3 | None]:
     paths = (mav / name / "data.csv" for name in _TRUTH_FOLDERS)
     path = next((path for path in paths if path.is_file()), None)
     if path is None:

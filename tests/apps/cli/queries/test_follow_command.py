@@ -95,3 +95,5 @@ def test_options_of_robots_need_ros(complaint: Callable[..., str], room_map: Pat
         "follow", room_map, "0", *both, status=2
     )
     assert "--odom needs --ros" in complaint("follow", room_map, "0", "--odom", "none", status=2)
+    frame = ("--base-frame", "base_footprint")
+    assert "--base-frame needs --ros" in complaint("follow", room_map, "0", *frame, status=2)

@@ -15,7 +15,7 @@ from topoloc import BuildConfig, TopoMetricMap, check_map
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.mapping.map_jobs import (
     MapJob,
-    Pieces,
+    MapPieces,
     PoseOptions,
     SplitOptions,
     split_recording,
@@ -117,7 +117,7 @@ class Command:
         is_for_ray = self.world is not None or self.replace or self.join or self.split is not None
         if self.ray is None and is_for_ray:
             raise UsageError("--world, --replace, --join and --split need --ray")
-        split = SplitOptions.of(self.split)
+        split = SplitOptions.parse(self.split)
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam")]
         check_outputs([target if self.ray is None else None, self.json], [*recordings, *read])
@@ -135,7 +135,7 @@ class Command:
         return self._make_map(map_job, Path(target))
 
     def _map_job(self, recordings: list[str], settings: Settings) -> MapJob:
-        config = settings.of(BuildConfig)
+        config = settings.get(BuildConfig)
         config = with_option(config, "nodes.d_thresh", self.d_thresh, "--d-thresh")
         config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
         if self.look_alike_floors:
@@ -197,7 +197,7 @@ class Command:
         jobs = [job for row in rows for job in row]
         with connect_to_cluster(ray):
             with recordings_table([job.recording for job in jobs]) as (show, is_live):
-                how = (self.replace, settings.of(ClusterConfig), show, is_live)
+                how = (self.replace, settings.get(ClusterConfig), show, is_live)
                 outcomes = build_on_ray(jobs, atlas, ray, *how)
             print_notes(outcomes, is_live)
             facts = report_outcomes(atlas, outcomes, {"built": "mapped"}, self.json != "-")
@@ -214,7 +214,7 @@ class Command:
 
         wholes = zip(derive_tile_ids(map_job.recordings), map_job.split_by_recording(), strict=True)
         pieces = [
-            Pieces([one]) if split is None else split_recording(one, name, split)
+            MapPieces([one]) if split is None else split_recording(one, name, split)
             for name, one in wholes
         ]
         names = [piece.recordings[0] for one in pieces for piece in one.piece_jobs]

@@ -74,7 +74,7 @@ class Command:
         if not self.idle > 0.0:
             raise UsageError(f"--idle {self.idle:g}: seconds above 0 are needed")
         check_outputs([self.map, self.json], [self.source])
-        config = read_settings(self.config).of(BuildConfig)
+        config = read_settings(self.config).get(BuildConfig)
         growing = GrowingMap(self.map, select_build_features(config, self.features))
         num_frames, num_lost, began = 0, 0, time.monotonic()
         with catch_stop_signals() as stop:

@@ -56,7 +56,7 @@ def parse_conventions(poses: str | None) -> tuple[PoseConventions, bool]:
     """Parse the option `--poses`, and return False if it contains `unchecked`: the poses are not
     compared with the images. Raises TrajectoryError."""
     names = (poses or "").split(",")
-    read = PoseConventions.of(",".join(name for name in names if name != "unchecked"))
+    read = PoseConventions.parse(",".join(name for name in names if name != "unchecked"))
     return read, "unchecked" not in names
 
 
@@ -209,7 +209,7 @@ class SplitOptions:
             )
 
     @staticmethod
-    def of(text: str | None) -> SplitOptions | None:
+    def parse(text: str | None) -> SplitOptions | None:
         """Parse the option, `500` or `500,50`. By default a tenth is shared. Raises UsageError."""
         if text is None:
             return None
@@ -231,7 +231,7 @@ class SplitOptions:
 
 
 @dataclass(frozen=True)
-class Pieces:
+class MapPieces:
     """The maps of successive pieces of a recording, and the world of its own poses. The world is
     None without such poses, and for a single map."""
 
@@ -239,7 +239,7 @@ class Pieces:
     world: str | None = None
 
 
-def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> Pieces:
+def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> MapPieces:
     """Split the recording of `map_job`.
 
     A short recording stays whole, and one that cannot be opened, so that its own task fails.
@@ -252,10 +252,10 @@ def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> Piece
             recording, map_job.format, map_job.camera, map_job.images, map_job.topics
         )
     except TopolocError:
-        return Pieces([map_job])
+        return MapPieces([map_job])
     ranges = split.ranges(len(sequence))
     if len(ranges) == 1:
-        return Pieces([map_job])
+        return MapPieces([map_job])
     options = map_job.pose_options
     if not options.trajectory and any(sequence.poses):  # also for pieces without a pose
         options = replace(options, trajectory=("truth",))
@@ -269,6 +269,6 @@ def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> Piece
         for start, stop in ranges
     ]
     if options.trajectory in ((), ("slam",)):
-        return Pieces(pieces)
+        return MapPieces(pieces)
     digest = sha256(os.fsencode(os.path.abspath(recording))).hexdigest()  # unique by recording
-    return Pieces(pieces, f"{tile_id[:80]}-{digest[:8]}")
+    return MapPieces(pieces, f"{tile_id[:80]}-{digest[:8]}")

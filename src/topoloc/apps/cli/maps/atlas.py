@@ -69,7 +69,7 @@ class Command:
         if self.action != "join":
             atlas = self._write()
             if not self.join:
-                return report_atlas(describe(self.atlas, atlas.manifest), self.json)
+                return report_atlas(describe_atlas(self.atlas, atlas.manifest), self.json)
             ids = [self.id or Path(name).name.removesuffix(".topo") for name in self.names]
         joined = join_overlapping_tiles(self.atlas, ids, settings, self.json != "-", ray=self.ray)
         return report_joined(self.atlas, joined, self.json)
@@ -110,14 +110,14 @@ def show_atlas(atlas: Atlas, check: bool, json: str | None) -> int:
     checksums. Return the exit status."""
     problems = [(name, atlas.find_problem(name)) for name in atlas.select_tiles() if check]
     found = [f"tile {name}: {problem}" for name, problem in problems if problem]
-    facts = describe(atlas.store.where, atlas.manifest)
+    facts = describe_atlas(atlas.store.where, atlas.manifest)
     return report_atlas(facts | ({"check": found or "ok"} if check else {}), json, found)
 
 
 def report_joined(where: str, joined: JoinedTiles, json: str | None) -> int:
     """Print the facts of an atlas and the pairs that could not be compared. Return the exit
     status."""
-    facts = describe(where, joined.manifest) | {"tried": joined.rows}
+    facts = describe_atlas(where, joined.manifest) | {"tried": joined.rows}
     return report_atlas(facts, json, joined.not_compared)
 
 
@@ -132,7 +132,7 @@ def report_atlas(facts: dict[str, Any], json: str | None, problems: Sequence[str
     return 1 if problems else 0
 
 
-def describe(where: str, manifest: Any) -> dict[str, Any]:
+def describe_atlas(where: str, manifest: Any) -> dict[str, Any]:
     """Return the facts of an atlas: those of its tiles, and their sums."""
     tiles, origin, worlds = list[dict[str, Any]](), manifest.origin, dict[str, list[str]]()
     for tile in manifest.tiles:
@@ -239,4 +239,4 @@ def _run_jobs_on(
         if not isinstance(state, JobProgress):
             report_pair(state)
 
-    return lambda jobs: run_on_ray(jobs, ray, settings.of(ClusterConfig), show)
+    return lambda jobs: run_on_ray(jobs, ray, settings.get(ClusterConfig), show)

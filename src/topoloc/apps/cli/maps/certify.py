@@ -80,7 +80,7 @@ class Command:
         check_outputs([self.json, self.report], read)
         write_page = _import_page_writer() if self.report else None
         map_from_truth = read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        config = read_settings(self.config).of(LocalizerConfig)
+        config = read_settings(self.config).get(LocalizerConfig)
         walks, others = ([self._open(one) for one in of] for of in (self.walk, self.out_of_map))
         with progress_bar() as progress:
             found = certify(
@@ -107,7 +107,7 @@ class Command:
     def _open(self, path: str) -> StereoSequence:
         sequence = open_recording(path, self.format, self.camera, whole_only=True)
         has_poses = any(sequence.poses) and path in self.walk
-        how = PoseConventions.of(self.poses)
+        how = PoseConventions.parse(self.poses)
         return with_pose_conventions(sequence, how) if has_poses else sequence
 
 

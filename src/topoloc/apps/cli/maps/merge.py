@@ -54,7 +54,7 @@ class Command:
 
     def _merge_maps(self, _: str) -> int:
         settings = self._read_settings(self.out, self.json)
-        config = settings.of(LocalizerConfig)
+        config = settings.get(LocalizerConfig)
         with progress_bar() as progress:
             c = merge(self.first, self.second, self.out, config, progress, print_waiting)
         if self.json != "-":

@@ -109,7 +109,7 @@ class Command:
 
     def _session_options(self, settings: Settings) -> list[SessionUpdateOptions]:
         read = (self.trajectory, self.poses, self.format, self.camera, self.topics, self.light)
-        config = settings.of(LocalizerConfig)
+        config = settings.get(LocalizerConfig)
         return [SessionUpdateOptions(path, config, *read) for path in self.paths[1:]]
 
     def _update_map(self, target: str, settings: Settings) -> int:
@@ -132,7 +132,7 @@ class Command:
         """Add each recording to its tile. The exit status is 1 if one fails."""
         if self.joined:
             raise UsageError("--joined needs a map file, not an atlas")
-        configs = settings.of(AtlasConfig), settings.of(ClusterConfig)
+        configs = settings.get(AtlasConfig), settings.get(ClusterConfig)
         options, where = self._session_options(settings), self.paths[0]
         outcomes = AtlasUpdate(options, atlas, self.tile, self.ray, *configs).outcomes()
         if self.json != "-":

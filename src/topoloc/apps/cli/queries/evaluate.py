@@ -102,8 +102,8 @@ class Command:
             return evaluate_map_itself(self.map, self.coarse, self.features, outputs, self.config)
         self._check_usage()
         settings = read_settings(self.config)
-        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
-        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
+        config = with_option(settings.get(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         tile_id = self._select_tile(localizer)
         with localizer.in_tile(tile_id) as in_tile:
             topomap = in_tile.topomap
@@ -117,8 +117,8 @@ class Command:
                     for answer in one.answers(sequence, localizer, tile_id, progress)
                 ]
             else:
-                sent = RemoteMap.of(localizer, tile_id, self.features)
-                cluster = settings.of(ClusterConfig)
+                sent = RemoteMap.from_localizer(localizer, tile_id, self.features)
+                cluster = settings.get(ClusterConfig)
                 answers = localize_on_ray(sent, opened, self.ray, cluster, progress)
         self._report(Evaluation(answers), localizer, topomap, info)
         return 0

@@ -58,8 +58,8 @@ class Command:
     def run(self) -> int:
         check_outputs([self.out, self.json], [self.map, self.config])
         settings = read_settings(self.config)
-        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
-        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
+        config = with_option(settings.get(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         frame = self._read_frame()
         of_size = None if self.camera is None else parse_camera(localizer, self.camera)
         camera = select_frame_camera(frame, of_size)

@@ -63,8 +63,20 @@ class Command:
     odom: Annotated[str | None, option("FRAME|none", "odom")] = None
     """With --ros: the frame of the odometry in TF. `none`: there is no odometry, and TF is from map
     to topoloc_camera."""
+    map_frame: Annotated[str | None, option("FRAME", "map")] = None
+    """With --ros: the frame of the map in TF."""
+    base_frame: Annotated[str | None, option("FRAME", "base_link")] = None
+    """With --ros: the frame of the robot in TF."""
+    camera_frame: Annotated[str | None, option("FRAME", "topoloc_camera")] = None
+    """With --ros: the optical frame of the camera in TF, if the images are of no topic."""
+    namespace: Annotated[str | None, option("NAME")] = None
+    """With --ros: the namespace of /topoloc/pose and /initialpose."""
     planar: Flag = False
     """With --ros: publish x, y and yaw only."""
+    use_sim_time: Flag = False
+    """With --ros: take the time from /clock."""
+    publish_initial_pose: Flag = False
+    """With --ros: publish the first confirmed pose on /initialpose, instead of reading it."""
     mavlink: Annotated[str | None, option("udpout:HOST:PORT")] = None
     """Send the poses to an autopilot, as ODOMETRY of a drone whose camera looks ahead. Or
     `udpin:HOST:PORT`, to whoever writes to this port."""
@@ -74,15 +86,15 @@ class Command:
     def run(self) -> int:
         settings = read_settings(self.config)
         localizer = open_localizer(
-            self.map, settings.of(LocalizerConfig), self.features, settings.of(AtlasConfig)
+            self.map, settings.get(LocalizerConfig), self.features, settings.get(AtlasConfig)
         )
         if self.ros or self.mavlink is not None:
             self._check_world(localizer)
         with ExitStack() as stack:
-            tracker = stack.enter_context(closing(Tracker(localizer, settings.of(TrackerConfig))))
+            tracker = stack.enter_context(closing(Tracker(localizer, settings.get(TrackerConfig))))
             stop = stack.enter_context(catch_stop_signals())
             of_size = None if self.camera is None else parse_camera(localizer, self.camera)
-            config, node, images = self._robot_config(settings.of(RobotConfig)), None, None
+            config, node, images = self._robot_config(settings.get(RobotConfig)), None, None
             if self.ros or is_topic(self.source):
                 node = stack.enter_context(closing(RosNode(config)))
             if node is not None and is_topic(self.source):
@@ -129,16 +141,31 @@ class Command:
             )
 
     def _robot_config(self, config: RobotConfig) -> RobotConfig:
-        given = [
-            name for name, value in (("--odom", self.odom), ("--planar", self.planar)) if value
-        ]
-        if given and not self.ros:
-            raise UsageError(f"{given[0]} needs --ros")
-        frame, is_planar = self.odom or config.odom_frame, self.planar or config.planar
-        config = replace(config, odom_frame=frame, planar=is_planar)
+        if not self.ros:
+            self._refuse_options_of_ros()
+        config = replace(
+            config,
+            odom_frame=self.odom or config.odom_frame,
+            map_frame=self.map_frame or config.map_frame,
+            base_frame=self.base_frame or config.base_frame,
+            camera_frame=self.camera_frame or config.camera_frame,
+            namespace=self.namespace or config.namespace,
+            planar=self.planar or config.planar,
+            use_sim_time=self.use_sim_time or config.use_sim_time,
+            publish_initial_pose=self.publish_initial_pose or config.publish_initial_pose,
+        )
         if config.planar and not config.has_odometry:
             raise UsageError("--planar is of a robot with odometry; leave out --odom none")
         return config
+
+    def _refuse_options_of_ros(self) -> None:
+        names = (
+            "odom map_frame base_frame camera_frame namespace planar use_sim_time"
+            " publish_initial_pose"
+        )
+        for name in names.split():
+            if getattr(self, name):
+                raise UsageError(f"--{name.replace('_', '-')} needs --ros")
 
 
 def _read_frames(sequence: StereoSequence) -> Iterator[QueryFrame]:

@@ -136,7 +136,7 @@ class Command:
         inputs = (self.map, *self.inputs, self.streams.odometry, self.config)
         check_outputs([self.json, self.tum, self.save_camera], inputs)
         near, settings = self._parse_near(), read_settings(self.config)
-        tracking = settings.of(TrackerConfig)
+        tracking = settings.get(TrackerConfig)
         if self.streams.max_jump is not None:
             tracking = with_option(tracking, "max_jump", self.streams.max_jump, "--max-jump")
             tracking = replace(tracking, mode="paper")
@@ -182,9 +182,9 @@ class Command:
         return answers
 
     def _open_localizer(self, settings: Settings, near: GeoPositionPrior | None) -> Localizer:
-        config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        config = with_option(settings.get(LocalizerConfig), "coarse", self.coarse, "--coarse")
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
-        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
+        localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         return localizer if near is None else localizer.near(near)
 
     def _parse_near(self) -> GeoPositionPrior | None:

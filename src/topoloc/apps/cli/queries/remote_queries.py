@@ -65,7 +65,7 @@ class QueryRecording:
     def open(self) -> StereoSequence:
         """Open the recording. Notes about it go to standard error. Raises the errors of
         `open_sequence`; UsageError: the pose convention is unknown."""
-        reading = PoseConventions.of(self.poses)
+        reading = PoseConventions.parse(self.poses)
         sequence = open_recording(self.path, self.format, self.camera, self.topics, whole_only=True)
         return sequence if self.is_out_of_map else with_pose_conventions(sequence, reading)
 
@@ -106,7 +106,7 @@ class RemoteMap:
     features: str | None
 
     @staticmethod
-    def of(localizer: Localizer, tile_id: str, features: str | None) -> RemoteMap:
+    def from_localizer(localizer: Localizer, tile_id: str, features: str | None) -> RemoteMap:
         """Return the description of this localizer for another process."""
         source, how = localizer.source, (localizer.config, localizer.tile_config, features)
         return RemoteMap(source, tile_id, frozenset(find_available_types(source.kinds)), *how)

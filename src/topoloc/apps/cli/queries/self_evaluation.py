@@ -28,7 +28,7 @@ def evaluate_map_itself(
     `outputs` names: json, report. Raises UsageError: an atlas has several tiles, or an output would
     replace an input; TopolocError: the map cannot be read, or a file cannot be written."""
     check_outputs(list(outputs.values()), [path, config])
-    localizer_config = read_settings(config).of(LocalizerConfig)
+    localizer_config = read_settings(config).get(LocalizerConfig)
     localizer_config = with_option(localizer_config, "coarse", coarse, "--coarse")
     json, report = outputs["json"], outputs["report"]
     write_page = _import_page_writer() if report else None

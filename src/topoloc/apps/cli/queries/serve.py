@@ -156,7 +156,7 @@ class Command:
         if self.ray is None and self.replicas is not None:
             raise UsageError("--replicas belongs to --ray")
         settings = read_settings(self.config)
-        config = settings.of(ServiceConfig)
+        config = settings.get(ServiceConfig)
         for name in ("memory_mb", "workers", "max_queue"):
             config = with_option(config, name, getattr(self, name), f"--{name.replace('_', '-')}")
         read_token(self.token_file)
@@ -174,7 +174,7 @@ class Command:
 
         if self.port == 0:
             raise UsageError("--ray listens on the same port of all machines: --port 0 names none")
-        replicas = self._parse_replicas(settings.of(ReplicasConfig))
+        replicas = self._parse_replicas(settings.get(ReplicasConfig))
         config = replace(config, workers=config.workers or replicas.cpus_per_replica)
         jobs = (config.num_workers, config.max_queue)
         tls = map(_absolute_path, (self.tls_cert, self.tls_key))
@@ -186,7 +186,11 @@ class Command:
         paths = tuple(one if self.ray is None else str(_absolute_path(one)) for one in self.maps)
         is_private = self.host in _LOOPBACK and not self.behind_proxy
         access = (_absolute_path(self.token_file), is_private)
-        configs = settings.of(LocalizerConfig), settings.of(TrackerConfig), settings.of(AtlasConfig)
+        configs = (
+            settings.get(LocalizerConfig),
+            settings.get(TrackerConfig),
+            settings.get(AtlasConfig),
+        )
         return ServedMaps(paths, self.features, *access, config, *configs, self._origins())
 
     def _origins(self) -> tuple[str, ...]:

@@ -116,12 +116,12 @@ def read_camera_info(bag: Bag, name: str | None, images: str | None) -> RosCalib
     found = camera_info(message, name)
     reduced, size = reduce_to_part(found, message), (found.width, found.height)
     # some drivers report binning with the calibration of the binned image
-    if (reduced.width, reduced.height) != size != read_image_size(bag, images):
+    if (reduced.width, reduced.height) != size != find_image_size(bag, images):
         found = reduced
     return found if found.is_calibrated else None
 
 
-def read_image_size(bag: Bag, name: str) -> tuple[int, int]:
+def find_image_size(bag: Bag, name: str) -> tuple[int, int]:
     """Return width and height of the first whole image of a topic. Return (0, 0) if there is none,
     because reading the images reports the error later."""
     for ref in bag.messages(name)[:10]:

@@ -32,10 +32,10 @@ from topoloc.apps.formats.bags.bag import (
 )
 from topoloc.apps.formats.bags.bag_calibration import (
     find_depth_camera,
+    find_image_size,
     find_left_camera,
     find_rig,
     read_camera_info,
-    read_image_size,
 )
 from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image, image_file
 from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
@@ -163,7 +163,7 @@ def open_bag(
     try:
         requested = parse_topics(topics) if isinstance(topics, str) else dict(topics or {})
         roles = select_topics(bag, requested)
-        given = calibration and calibration(*read_image_size(bag, roles.left))
+        given = calibration and calibration(*find_image_size(bag, roles.left))
         recording = _open_recording(bag, roles, given)
     except ModuleNotFoundError as error:
         raise missing_bags_error(error, path) from error

@@ -37,7 +37,7 @@ from topoloc.apps.service.protocols.geopose_messages import (
     read_image_size,
     read_request,
 )
-from topoloc.apps.service.query_handler import Failures, Results, fit_camera
+from topoloc.apps.service.query_handler import Failures, Results, adapt_camera
 from topoloc.apps.service.query_request import camera_from_json, parse_camera_field, read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
@@ -112,7 +112,7 @@ def _localize_and_reply(
         with failures.leaving_out(name), service.maps.use_map(name) as opened:
             topomap = opened.content.topomap
             if topomap.georeference is not None:
-                camera = fit_camera(_select_camera(reading, picture, size, topomap), size, image)
+                camera = adapt_camera(_select_camera(reading, picture, size, topomap), size, image)
                 results[name] = opened.content.localize(image, camera, max_ms=deadline)
                 georeferences[name] = topomap.georeference
     near = query.near(service.config.geolocation_m)
@@ -121,7 +121,7 @@ def _localize_and_reply(
         places = {tile.tile_id: manifest.georeference_of(tile) for tile in manifest.tiles}
         known = {tile_id: place for tile_id, place in places.items() if place is not None}
         if known:
-            camera = fit_camera(_select_camera(reading, picture, size, None), size, image)
+            camera = adapt_camera(_select_camera(reading, picture, size, None), size, image)
             nearby = localizer.near(near, georeferenced_only=True)
             result = nearby.localize(image, camera, max_ms=deadline)
             results[result.provenance.tile or ""] = result
