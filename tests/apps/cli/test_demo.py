@@ -108,7 +108,7 @@ def test_without_matplotlib_all_but_the_report_is_done(
     }
 
 
-@pytest.mark.slow  # the tests of quickstart and examples map and ask the same recordings
+@pytest.mark.slow  # the tests of quickstart and examples use the same recordings
 @pytest.mark.skipif(
     bool(find_missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
 )

@@ -95,7 +95,7 @@ def test_the_recording_before_stays(film: Path, tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_in_good_order(film: Path, tmp_path: Path, number: signal.Signals):
-    pipe = tmp_path / "endless"  # pictures that never end: MJPEG through a pipe
+    pipe = tmp_path / "endless"  # endless images: MJPEG through a pipe
     os.mkfifo(pipe)
     command = [
         sys.executable,
