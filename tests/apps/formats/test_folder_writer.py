@@ -80,7 +80,7 @@ def test_depth_comes_back(tmp_path: Path):
         assert one.depth is not None
         np.testing.assert_allclose(
             its.depth.depth, one.depth.depth, atol=0.0021
-        )  # half a step; NaN where it is unknown
+        )  # half a step, NaN if unknown
         assert its.world_from_cam is None
 
 

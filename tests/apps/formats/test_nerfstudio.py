@@ -16,7 +16,7 @@ from topoloc.errors import CalibrationError, RecordingError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import find_format, open_sequence
 
-# The columns of nerfstudio's matrix are right, up and back; ours are right, down and forward.
+# The columns of Nerfstudio's matrix are right, up and back. Ours are right, down and forward.
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 LENS: dict[str, Any] = {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "fl_y": 41.0, "cx": 16.0, "cy": 12.0}
 Make = Callable[..., Path]
