@@ -200,7 +200,7 @@ def test_the_own_port_answers_who_wrote_to_it():
     with _receiver() as free:
         port = free.getsockname()[1]
     publisher = MavlinkPublisher(f"udpin:127.0.0.1:{port}")
-    publisher.publish(0, Rigid3.identity(), _NONE, 0.9)  # nobody is there yet
+    publisher.publish(0, Rigid3.identity(), _NONE, 0.9)  # no receiver is connected yet
     with _receiver() as receiver:
         receiver.sendto(b"\xfd", ("127.0.0.1", port))
         publisher.publish(1000, Rigid3.identity(), _NONE, 0.9)

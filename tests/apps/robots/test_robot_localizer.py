@@ -170,7 +170,7 @@ def test_map_to_odom_is_that_of_the_measured_poses(make: Callable[..., Robot]):
     assert np.allclose(pose.matrix(), MAP_FROM_ODOM.matrix(), atol=1e-9)
     assert 0.0 < (t_ns - time.time_ns()) / 1e9 <= 0.2  # ahead
     poses = [pose for _, pose in robot.published.poses]
-    assert len(poses) == 3  # the third of those that agree, and later ones
+    assert len(poses) == 3  # the third agreeing pose, and later ones
     expected = MAP_FROM_ODOM @ robot.base(4)
     assert np.allclose(poses[-1].matrix(), expected.matrix(), atol=1e-9)
     assert robot.warnings == []
