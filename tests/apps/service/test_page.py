@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(
 )
 NOTHING = SHIPPED / "pictures_of_nothing" / "black.png"
 ANSWERED = "#answer h2.good, #answer h2.bad"
-# As if a picture were dropped on the page, or pasted.
+# Drop an image on the page, or paste it.
 BROUGHT = """([how, name, base64]) => {
   const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
   const data = new DataTransfer();
@@ -340,7 +340,7 @@ def test_a_map_that_grows_is_drawn_again_seen_as_before(browser: Any, lab: Lab):
         page.keyboard.press("Tab")
         page.locator("#scene canvas").press("ArrowLeft")
         seen_from = page.evaluate(view)
-        page.wait_for_timeout(3500)  # the page has asked once
+        page.wait_for_timeout(3500)  # the page has polled once
         more.save(growing)
         for _ in range(200):
             if page.evaluate(nodes) != before:

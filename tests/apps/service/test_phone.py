@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(
 )
 FRAMES = (3, 4, 5)
 SIGHT = "document.querySelector('[data-part=sight]').sight"
-# What is drawn now: the image of the last answer, its place on the canvas, and points with pixels.
+# The overlay: the image of the last result, its place on the canvas, and points with pixels.
 DRAWN = f"""() => {{
   const sight = {SIGHT};
   if (!sight.seen) return null;
@@ -236,7 +236,7 @@ def test_the_motion_sensor_is_read_in_every_position_of_the_screen(phone: Phone)
           });
         }"""  # noqa: E501
     )
-    # rows of east, north, up; columns of right, down, forward
+    # rows: east, north, up. Columns: right, down, forward
     for one in seen:
         np.testing.assert_allclose(one, [1, 0, 0, 0, 0, 1, 0, -1, 0], atol=1e-9)
     page.close()

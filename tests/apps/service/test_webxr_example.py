@@ -21,7 +21,7 @@ from topoloc.geometry.rigid import Rigid3
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 
-# A session whose camera sees one picture. `window.drawn`: the pixels of the axes, from the bottom.
+# A session whose camera sees one image. `window.drawn`: the pixels of the axes, from the bottom.
 SESSION = """(([image, projection, pose, inverse]) => {
   const picture = new Image();
   picture.src = image;
