@@ -71,7 +71,7 @@ def test_without_a_pose_the_truth_tells_right_from_wrong(topomap: TopoMetricMap)
     )
     off = _seen_in_node(topomap, 2, known, truth)
     assert known.is_inlier.any()
-    np.testing.assert_array_equal(known.is_inlier, off <= 4.0)  # 8 px in a picture of 640
+    np.testing.assert_array_equal(known.is_inlier, off <= 4.0)  # 8 px in an image of 640
     unknown = match_with_node(
         EvaluatedQuery("q", NotLocalized("not_in_map"), None),
         picture,

@@ -25,8 +25,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
 
 HALL_FROM_ROOM = Rigid3(exp_so3(np.array([0.0, 0.0, 0.5])), np.array([10.0, -2.0, 1.0]))
-"""`hall` and `room` are the same map, said to lie so to each other; `far` is a third one, of which
-nothing is known."""
+"""Join of `hall` and `room`, which are copies of one map. `far` is a third copy without a join."""
 
 
 @pytest.fixture(scope="module")
