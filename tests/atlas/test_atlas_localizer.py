@@ -205,7 +205,7 @@ def test_a_tile_that_cannot_be_read_leaves_the_rest(own_atlas: Path, harm: str):
     of_other = localizer.localize(unseen_views(seed=1)[1][0], CAMERA)
     assert of_other.localized == harm.startswith(
         "places"
-    )  # whose places cannot be ranked is asked after the others
+    )  # a tile without readable descriptors is searched last
     assert len(said) == 1
     assert said[0].startswith("tile other ")
     assert str(path.name) in said[0]

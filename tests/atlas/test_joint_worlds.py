@@ -140,7 +140,7 @@ def test_tiles_of_one_world_are_joined_together():
     way = manifest.by_id["b"].from_world_of(manifest.by_id["c"])
     assert way is not None
     assert np.allclose(way.matrix(), (WORLDS["a"] @ WORLDS["c"].inverse()).matrix(), atol=1e-9)
-    assert _manifest([_join("a", "b")], a="house", b="house").joins == ()  # which know it without
+    assert _manifest([_join("a", "b")], a="house", b="house").joins == ()  # one world needs no join
 
 
 def test_one_tile_on_earth_is_enough():

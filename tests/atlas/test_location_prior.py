@@ -150,4 +150,4 @@ def test_a_picture_is_asked_only_of_tiles_in_reach(atlas: Path):
     assert "no tile lies within 5 m of 0, 0, 500 in the world room" in nowhere.detail
     assert isinstance(
         localizer.localize(image, CAMERA), Localization
-    )  # the one that it came from asks all as before
+    )  # the original localizer still searches all tiles
