@@ -38,7 +38,7 @@ def _along(result: Localization | NotLocalized) -> float:
     return float(result.world_from_cam.translation[0])
 
 
-# of the same pose, the one with the most for it
+# the strongest hypothesis of each pose
 
 
 def test_a_hypothesis_of_the_same_pose_replaces_the_weaker_one_and_not_the_stronger():
@@ -187,7 +187,7 @@ def test_another_hypothesis_far_behind_takes_a_little_of_the_probability():
     assert beside.probability < alone.probability
 
 
-# two places that look alike
+# two similar places
 
 
 def test_two_places_that_look_alike_are_ambiguous_and_both_are_named():
@@ -237,7 +237,7 @@ def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(
     assert isinstance(_answered(best, wrong), Localization) is is_answered
 
 
-# the walls along the way
+# virtual views
 
 
 @pytest.mark.parametrize(
@@ -350,7 +350,7 @@ def test_a_place_beyond_doubt_but_imprecise_is_not_answered():
     assert imprecise.detail.startswith("in the map, but where is known to")
 
 
-# nothing to believe
+# no probable hypothesis
 
 
 def test_hypotheses_that_are_not_probable_are_no_answer():
@@ -392,7 +392,7 @@ def test_what_is_asked_of_an_answer_can_be_set():
         assert isinstance(result, Localization) is is_answer
 
 
-# when nothing else is asked
+# when the search ends
 
 
 def test_it_is_settled_where_it_is_clear_and_no_other_place_comes_near():

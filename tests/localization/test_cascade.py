@@ -122,7 +122,7 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
         lambda search, hypothesis: (says, None),
     )
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), (
-        "it is settled: nobody else is heard"
+        "it is settled: no other feature type is used"
     )
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
@@ -193,7 +193,7 @@ def test_the_second_begins_with_the_poses_that_the_first_left_open(
     trace = Trace()
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, trace=trace))
     sizes = [tried.first.features.descriptors.shape[1] for tried in trace.tried]
-    assert [size for size, _ in groupby(sizes)] == [64, 128]  # SURF, then SIFT, whose answer stands
+    assert [size for size, _ in groupby(sizes)] == [64, 128]  # SURF, then SIFT, which localizes it
     assert "other features" in {tried.source for tried in trace.tried}
 
 
@@ -277,7 +277,7 @@ def test_a_stream_goes_through_a_map_of_two_kinds(
         assert _is_right(streamed.result, truth, 0.03)
 
 
-# kinds that cannot be asked
+# missing feature types
 
 
 @pytest.fixture

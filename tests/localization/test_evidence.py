@@ -32,8 +32,8 @@ STRONG = Evidence(
     doubt=0.1,
     even_share=0.15,
 )
-# What peers accept: scores of inliers, though nearly all that the pose predicts is missing, and
-# chance finds as many.
+# Peers accept this pose for its inliers, though nearly all predicted points are missing, and chance
+# finds as many.
 MANY_OF_VERY_MANY = Evidence(
     num_matches=40,
     num_inliers=6,

@@ -103,7 +103,7 @@ def test_another_camera_is_named_only_where_it_explains_the_picture_better(
     frame = open_sequence(queries)[0]
     assert frame.camera is not None
     doubted = localizer.localize(frame.image, with_focal(frame.camera, 1.08))
-    assert gains[-1] > 6.0  # twice what is asked
+    assert gains[-1] > 6.0  # twice the threshold
     monkeypatch.setattr(image_calibration_check, "_gain", lambda before, after: 0.0)
     believed = localizer.localize(frame.image, with_focal(frame.camera, 1.08))
     assert "the picture says f" in (

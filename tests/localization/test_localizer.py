@@ -232,7 +232,7 @@ def test_a_query_s_own_time_comes_before_that_of_the_settings(localizer: Localiz
     ] == [True, False, False]
 
 
-# what was tried
+# the trace
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ def test_the_first_query_computes_nothing_of_the_map(
     assert localizer.context.first.map.focal == frame.camera.fx
     Localizer(TopoMetricMap.load(room_map)).localize(
         frame.image, frame.camera
-    )  # what Numba compiles is hashed, too
+    )  # Numba hashes its code, too
 
     def never(*args: object) -> None:
         raise AssertionError("a digest of the nodes, or what the map knows, at a query")

@@ -59,7 +59,7 @@ def _wall(num_panels: int, noise: float = 0.0) -> LocalMap:
     )
 
 
-# shifts within what is nearby
+# shifts to nearby copies
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])

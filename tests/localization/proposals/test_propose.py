@@ -45,7 +45,7 @@ def _sources(trace: Trace) -> list[str]:
     return [tried.source for tried in trace.tried]
 
 
-# look-alikes
+# similar places
 
 
 def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(
@@ -260,7 +260,7 @@ def test_a_prior_that_is_wrong_makes_no_place_of_an_image_from_elsewhere(room: T
         assert isinstance(localizer.localize(picture, CAMERA, prior=somewhere), NotLocalized)
 
 
-# what was found already
+# repeated poses
 
 
 def test_a_pose_that_was_found_already_is_not_followed_up_again(

@@ -99,7 +99,7 @@ def test_the_way_back_is_localized_by_the_walls():
     answered = [
         _is_right(result, truth) for result, truth in answers if isinstance(result, Localization)
     ]
-    assert len(answered) < 0.5 * len(answers)  # where viewpoints suffice
+    assert len(answered) < 0.5 * len(answers)  # localized by node viewpoints
     assert all(answered)
 
 
@@ -117,7 +117,7 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
         assert 0.5 <= result.probability <= 1.0
         node = topomap.summaries[
             result.node_id
-        ]  # an ordinary one, which saw the same wall from its other side
+        ]  # a mapping image of the same wall from the other direction
         assert node.name in with_sides
         assert 2.0 < truth.translation[1] - node.world_from_cam.translation[1] < 7.5
         assert len(result.candidates) == localizer.config.num_candidates
@@ -408,7 +408,7 @@ def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
 
 def test_walls_that_the_nodes_own_kind_describes_are_asked_still(monkeypatch: pytest.MonkeyPatch):
     network = default_learned_type()
-    with monkeypatch.context() as patch:  # as maps were, before walls had a network of their own
+    with monkeypatch.context() as patch:  # like maps before the network for virtual views
         patch.setitem(FEATURE_TYPES, network, replace(FEATURE_TYPES[network], sides=None))
         topomap = build_map(
             WalkAhead(0), BuildConfig(features=FeatureConfig(kind=network), other_kinds=())

@@ -39,7 +39,7 @@ def test_each_side_node_names_a_place_that_looks_back_at_its_wall(
     named = _named(index, views)
     assert sum(len(of_view.likeness) for of_view in named) == len(
         index.axes
-    )  # to the left who comes back sees what was to the right
+    )  # left and right are exchanged in reverse direction
     for view, of_view in zip(views, named, strict=True):
         assert (of_view.rotations[:, :, 2] @ back(5.0).rotation[:, 2] > 0.9).all()
         for rotation, centre in zip(of_view.rotations, of_view.centres, strict=True):

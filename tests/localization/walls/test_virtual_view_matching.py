@@ -71,8 +71,8 @@ def test_the_side_nodes_around_a_pose_show_the_wall_that_it_sees_whoever_stood_w
         side_ids = select_nearest_virtual_nodes(view, back(y).inverse(), centres, axes, 3)
         assert 1 <= len(side_ids) <= 3
         to_the_right = (back(y) @ view.cam_from_virtual).rotation[0, 2]
-        assert (centres[side_ids, 0] * to_the_right > 1.0).all()  # on the one wall
-        # who stands at y and looks back sees what is 1 to 3 wall distances behind y; its middle
+        assert (centres[side_ids, 0] * to_the_right > 1.0).all()  # all on the same wall
+        # a camera at y in reverse direction sees 1 to 3 wall distances behind y, and the middle
         # comes first
         off_middle = np.abs(centres[side_ids, 1] - (y - 2.2))
         assert off_middle[0] < 0.6
@@ -142,7 +142,7 @@ def test_visible_points_are_counted_by_what_they_cover_not_by_how_many_nodes_hol
 
 def test_what_must_be_seen_lies_in_the_picture_where_the_points_are():
     counts = count_virtual_views(_around(), TRUTH.inverse(), GUIDED)
-    assert counts.agreeing_img is None  # SURF says nothing of what is not found
+    assert counts.agreeing_img is None  # SURF has no dense descriptors
     assert 100 < len(counts.visible_img) <= 2 * 512
     points_img = np.concatenate(
         [WIDE.img_from_cam(TRUTH.inverse().apply(points.points_world)) for _, points in _around()]
