@@ -171,7 +171,7 @@ def test_a_room_of_the_same_plan_is_not_joined(joined_once: tuple[Path, TileJoin
     pairs = [
         (a.tile_id, b.tile_id) for a, b in find_candidate_pairs(Atlas.open(str(where)), {"left"})
     ]
-    assert pairs == [("left", "other")]  # what is joined is not compared again
+    assert pairs == [("left", "other")]  # joined tiles are not compared again
 
 
 def test_answers_agree_through_the_joins_and_say_where_in_the_joint_world(
