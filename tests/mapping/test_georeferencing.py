@@ -114,7 +114,7 @@ def test_known_points_give_any_world_back(angles: tuple[float, float, float]):
 def test_gnss_is_believed_where_it_agrees():
     way = np.repeat(WALK, 5, axis=0) + np.linspace(0, 0.5, 40)[:, None]
     places = places_of(way, noise=0.3)
-    for k in range(0, 40, 4):  # a wall
+    for k in range(0, 40, 4):  # outliers, as beside a wall
         places[k] = TRUE.geopoint(way[k] + [15.0, 5.0, 8.0])
     fit = fit_georeference(way, places, "gnss", Z_UP)
     assert list(np.flatnonzero(~fit.is_inlier)) == list(range(0, 40, 4))

@@ -39,7 +39,7 @@ def test_any_flipped_bit_is_found_or_does_no_harm(saved: Path):
             harmed = ["cannot be opened"]
         if harmed:
             found += 1
-        else:  # a byte that nothing is read from: what is saved again is what it was
+        else:  # an unused byte: the saved copy is unchanged
             TopoMetricMap.load(saved).save(saved)
             assert saved.read_bytes() == content
     assert found > 0.8 * len(places)

@@ -65,7 +65,7 @@ def test_errors_shrink_and_covariances_stay_honest():
     assert np.median(after) < 0.3 * np.median(before)
     error = refined.points_cam - s.truth
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(refined.covariances), error)
-    # 3 on average were it exact; the robust weights make it a little too careful
+    # an exact covariance gives 3 on average, and the robust weights make it slightly larger
     assert 1.5 < nees.mean() < 3.6
     assert refined.is_consistent.mean() > 0.99
     assert refined.num_observations.sum() == sum(len(seen.rows) for seen in s.observations)

@@ -130,7 +130,7 @@ def test_a_failed_write_leaves_the_old_map_and_nothing_else(
     before = path.read_bytes() if there_before else None
     monkeypatch.setattr(
         map_writing, "compute_map_digest", stop(error)
-    )  # asked for last, after all nodes are written
+    )  # called last, after all nodes are written
     with pytest.raises(MapError, match=r"cannot write map .*room\.topo: No space left"):
         tiny_map.save(path)
     assert (path.read_bytes() if path.exists() else None) == before

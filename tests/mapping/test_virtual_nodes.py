@@ -88,7 +88,7 @@ def test_covariances_cover_the_errors_and_are_turned_with_the_camera(sides: Virt
         assert (
             np.nanquantile(np.abs(depth_errors(node)) / np.sqrt(covariances[:, 2, 2]), 0.95) < 3.0
         )
-        # stereo knows least along the ray, which the side camera sees slanted
+        # stereo is least exact along the ray, which is slanted in the virtual view
         rays = node.points_cam / np.linalg.norm(node.points_cam, axis=1, keepdims=True)
         worst = np.linalg.eigh(covariances)[1][:, :, 2]
         assert np.median(np.abs(np.sum(rays * worst, axis=1))) > 0.95
@@ -194,7 +194,7 @@ def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
         select_virtual_view_nodes(poses, spaced(3.0)) for poses in (there, there + back_again)
     )
     assert both < alone
-    assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond where anybody came back
+    assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond the part mapped in reverse direction
     assert {k for k in alone if k > 39 + 10} == {k for k in both if k > 39 + 10}
 
 
