@@ -29,7 +29,7 @@ def w_first(pose: Rigid3) -> Rigid3:
     return Rigid3.from_quat_wxyz(np.array([z, w, x, y]), pose.translation)
 
 
-# what poses look like that are of another convention, and what is said of them
+# Poses in other conventions, and words of their error messages.
 WRONG: dict[str, tuple[Callable[[Rigid3], Rigid3], tuple[str, ...]]] = {
     "inverse": (Rigid3.inverse, ("inverse",)),
     "opengl": (lambda pose: Rigid3(pose.rotation @ FLIP, pose.translation), ("opengl",)),

@@ -78,7 +78,7 @@ def looking_at(*recordings: StereoSequence):
 def test_what_both_sides_of_a_gap_see_at_their_edges_joins_them_and_no_frame_is_lost(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    limit = 120  # no single pair of pictures is believed, except by joins
+    limit = 120  # no single image pair suffices, except for joins
     for module, function in (("odometry", match_places), ("loop_closure", match_keyframes)):
         strict = partial(function, min_inliers=limit)
         monkeypatch.setattr(f"topoloc.slam.{module}.{function.__name__}", strict)
