@@ -11,7 +11,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.tracking.stream_result import StreamedPose
 
 PANELS = (2.0, -1.0, 0.0, 1.0)
-"""Where a picture of panels alone may have been taken; the truth is third."""
+"""Possible offsets of an image that shows only panels. The truth is third."""
 
 
 def is_right(answer: StreamedPose, walk: Walk) -> bool:

@@ -113,7 +113,7 @@ def test_noise_is_averaged():
 
 
 def test_odometry_replaces_the_velocity():
-    share = 0.05  # of the way, the error of the odometry
+    share = 0.05  # relative error of the odometry
     state = start_motion(0, pose_at(0.0), SIGMA)
     motion = pose_at(0.0).inverse() @ pose_at(2.0)
     predicted = predict_motion(state, 2_000_000_000, CONFIG, motion)

@@ -17,7 +17,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.tracking.tracker import Tracker
 
 ROUGHLY = np.diag([0.25, 0.25, 0.01, 0.01, 0.01, 0.07])
-"""What RViz gives, about the position."""
+"""Covariance about the position, as RViz sends it."""
 ASIDE = Rigid3(np.eye(3), np.array([0.3, -0.2, 0.05]))
 
 
