@@ -28,7 +28,7 @@ def test_what_a_kind_says_of_itself_is_so(
     assert 100 < len(features) <= 200
     assert features.descriptors.shape[1] == kind.descriptor_size
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-3)
-    # what a map file clips is rare: the kind's scale suits its descriptors
+    # few values are clipped in a map file: the scale of the type suits its descriptors
     assert np.mean(np.abs(features.descriptors) * kind.descriptor_scale > 127) < 1e-3
     assert (np.ptp(features.sizes_px) > 0) == kind.has_scale
     assert (np.ptp(features.angles) > 0) == kind.has_angle

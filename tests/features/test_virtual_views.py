@@ -25,7 +25,7 @@ CAMERAS = {
     "fisheye": Camera(
         "OPENCV_FISHEYE", 640, 480, (350.0, 351.0, 322.0, 238.0, 0.01, -0.02, 0.005, -0.001)
     ),
-    # The ends of its rows see what lies behind the camera.
+    # The ends of its rows see behind the camera.
     "wider than half of all": Camera(
         "OPENCV_FISHEYE", 800, 600, (220.0, 220.0, 399.5, 299.5, 0.0, 0.0, 0.0, 0.0)
     ),
@@ -122,7 +122,7 @@ def test_features_between_pixels_are_the_points_of_the_same_wall_in_the_picture(
     points_side = view.cam_from_virtual.inverse().apply(points_cam)
     np.testing.assert_allclose(
         points_side[:, 2], distance
-    )  # no slant: the wall is as far away everywhere
+    )  # no slant: the depth of the wall is constant
     features = features_at(view.camera.img_from_cam(points_side))
     np.testing.assert_allclose(
         view.to_image_pixels(features, camera).points_img,
@@ -155,8 +155,7 @@ def in_grey(cells: np.ndarray, cell_m: float) -> np.ndarray:
 @pytest.mark.parametrize("name", SIDES)
 def test_lettering_on_a_wall_stays_readable(name: str, camera: Camera):
     sheet = np.zeros((9, 28), np.float32)
-    # 2 m ahead: to the right of who looks at the left wall, to the left of who looks at the right
-    # one
+    # 2 m ahead: on the right in a view of the left wall, on the left in a view of the right wall
     first = 19 if name == "left" else 5
     sheet[2:7, first : first + 4] = LETTER
     view, picture = seen(name, camera, in_grey(sheet, 0.1))

@@ -143,7 +143,7 @@ def test_the_covariance_counts_what_is_not_known_of_the_focal_length():
         plain.append(float(np.sqrt(found[0].covariance[2, 2])))
     assert (
         0.5 < np.median(distances) < 9.0
-    )  # chi-square of six degrees: median 5.3; the principal point is in the middle here
+    )  # chi-square of six degrees has median 5.3, and the principal point is central here
     assert np.median(plain) > 0.03, "distance and focal length trade places in a flat scene"
 
 

@@ -17,7 +17,7 @@ from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 
 CAMERA = Camera.pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
-SIGMAS = np.array([0.02, 0.015, 0.015])  # a picture alone: 5 % of the focal length are 2.5 sigmas
+SIGMAS = np.array([0.02, 0.015, 0.015])  # one image: 5 % of the focal length are 2.5 sigmas
 
 
 def pictures(

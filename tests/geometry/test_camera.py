@@ -98,7 +98,7 @@ def test_points_behind_the_camera_have_no_pixel(model):
 
 def test_points_beyond_the_fold_of_the_distortion_have_no_pixel():
     camera = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
-    fold = np.sqrt(1 / 0.9)  # where 1 - 3 * 0.3 r^2 = 0
+    fold = np.sqrt(1 / 0.9)  # at 1 - 3 * 0.3 r^2 = 0
     points_cam = np.array(
         [[0.98 * fold, 0.0, 1.0], [1.02 * fold, 0.0, 1.0], [2.0 * fold, 0.0, 1.0]]
     )

@@ -40,7 +40,7 @@ def test_steps_two_percent_too_long_are_two_percent_of_drift():
     straight = [Rigid3(np.eye(3), np.array([0.0, 0.0, float(i)])) for i in range(60)]
     longer = [Rigid3(np.eye(3), 1.02 * pose.translation) for pose in straight]
     assert relative_drift(straight, longer) is not None
-    # a straight way fixes no rotation by positions alone: the errors are those along it, centred
+    # positions on a line fix no rotation about it: the errors are along it, centred
     np.testing.assert_allclose(
         absolute_trajectory_errors(straight, longer), 0.02 * np.abs(np.arange(60) - 29.5), atol=1e-6
     )

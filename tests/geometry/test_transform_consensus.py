@@ -109,7 +109,7 @@ def test_many_estimates_from_one_picture_are_one():
     estimates = estimates_of(a_from_b, covariances, rng)
     one_picture = np.column_stack([np.zeros(8, np.int64), np.arange(8)])
     assert find_consensus(estimates, covariances, one_picture) is None
-    # three pictures of a with three of b, crosswise: nine estimates say what three do
+    # three images of a with three of b, crosswise: nine estimates count as three
     crosswise = np.array([[i, j] for i in range(3) for j in range(3)])
     covariances = random_covariances(rng, 9)
     found = find_consensus(estimates_of(a_from_b, covariances, rng), covariances, crosswise)

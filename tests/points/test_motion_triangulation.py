@@ -82,7 +82,7 @@ def test_mismatches_are_not_believed():
     rng = np.random.default_rng(3)
     wrong = rng.random(len(points)) < 0.3
     order = []
-    for _ in POSES:  # each picture is wrong about these points in another way
+    for _ in POSES:  # these points have other mismatches in each image
         rows = np.arange(len(points))
         rows[wrong] = rng.permutation(rows[wrong])
         order.append(rows)

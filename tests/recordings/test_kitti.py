@@ -37,7 +37,7 @@ def test_colour_pair_where_there_is_no_grey_one(kitti: Path):
     # P2 and P3 are K [I | t] with t_x = 3 / 60 and -27 / 60.
     assert frame.rig.baseline == pytest.approx(0.5)
     assert frame.rig.is_rectified
-    # The rows are the poses of camera 0; t is the translation of cam2_from_cam0.
+    # The rows are the poses of camera 0, and t is the translation of cam2_from_cam0.
     cam2_from_cam0 = Rigid3(np.eye(3), np.array([0.05, 0.0, 0.0]))
     assert_same_pose(frame.world_from_cam @ cam2_from_cam0, pose(0))
 
