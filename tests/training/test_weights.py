@@ -152,7 +152,7 @@ def test_published_weights_are_fetched_once_and_their_hash_is_checked(
     name = f"squeezenet1_1-{hashlib.sha256(data).hexdigest()[:8]}.pth"
     monkeypatch.setitem(weights_module._PUBLISHED, "squeezenet1_1", name)
     assert find_weights("squeezenet1_1", None) is not None
-    monkeypatch.setattr(urllib.request, "urlopen", None)  # from the cache: not asked again
+    monkeypatch.setattr(urllib.request, "urlopen", None)  # from the cache: no second download
     assert find_weights("squeezenet1_1", None) is not None
 
 

@@ -147,7 +147,7 @@ def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
 
 def test_every_family_is_judged_by_a_fit_without_it():
     poses = _drawn(3000)
-    # in one family the evidence says the opposite: only a fit that has seen it could know
+    # the evidence of one family is inverted, which a fit without it cannot learn
     turned = [
         replace(pose, error_m=3.0 if pose.is_right else 0.01) if pose.mapping == MAPS[0] else pose
         for pose in poses

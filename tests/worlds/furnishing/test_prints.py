@@ -79,7 +79,7 @@ def test_reflectances_are_true_to_life(name: str):
     assert not isinstance(material.color, tuple)
     linear = (material.color / 255.0) ** 2.2
     assert 0.03 < linear.mean() < 0.85
-    # Structure is faint: rooms are not test pictures.
+    # Structure is faint: rooms are no test charts.
     assert 0.002 < linear.mean(axis=2).std() < 0.12
 
 

@@ -26,7 +26,7 @@ CONFIG = RenderConfig(bake=LightBakeConfig(finest=0.1, angle=0.03, rays=4000, pa
 FLOOR = Surface(
     "floor", panel((-4, 4, 0), (8, 0, 0), (0, -8, 0)), Material("matt", (0.5, 0.5, 0.5))
 )
-GREY = 0.2140  # what 0.5 of sRGB reflects
+GREY = 0.2140  # reflectance of 0.5 in sRGB
 
 
 @pytest.fixture(autouse=True)
