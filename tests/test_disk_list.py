@@ -53,9 +53,7 @@ def test_it_is_a_list_whatever_lies_on_disk(changes: list[tuple[int, int]], max_
 
 
 def test_only_so_much_stays_in_memory():
-    frames = [
-        Frame(str(k), np.zeros(5000)) for k in range(50)
-    ]  # what is referred to does not count
+    frames = [Frame(str(k), np.zeros(5000)) for k in range(50)]  # shared objects do not count
     there = DiskList(entries(50, frames), max_bytes=8_000, shared_objects=frames)
     assert len(there._cache) == 10
     assert there[0].values[0][0] == 0.0

@@ -23,7 +23,7 @@ from topoloc.apps.cli import COMMANDS, EXAMPLES, PLUGIN_PACKAGES, all_commands, 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("cv2", "faiss", "fastapi", "httpx", "matplotlib", "numba", "numpy", "onnxruntime")
 HEAVY += ("poselib", "pydantic", "torch", "tyro", "uvicorn")
-# What the core runs without: the extras, and the tests' own tools.
+# The core runs without these: the extras and the tools of the tests.
 FOREIGN = (
     "torch",
     "torchvision",
