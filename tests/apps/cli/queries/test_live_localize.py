@@ -65,7 +65,7 @@ def test_the_newest_pictures_are_localized(
         ),
     ],
 )
-def test_what_is_refused(
+def test_invalid_options_are_refused(
     room_map: Path, inputs: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
 ):
     assert main(["localize", str(room_map), *inputs]) == status
