@@ -171,7 +171,7 @@ def client_of(world: StandInWorld) -> SimpleNamespace:
     return SimpleNamespace(get_world=lambda: world)
 
 
-def test_a_way_is_recorded(tmp_path: Path):
+def test_a_route_is_recorded(tmp_path: Path):
     world = StandInWorld()
     with RecordingWriter(tmp_path / "out") as writer:
         for frame in carla_frames(carla, client_of(world), CONFIG, SIZE):

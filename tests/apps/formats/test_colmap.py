@@ -221,7 +221,7 @@ def test_names_that_lead_out_of_the_folder(model: Make, name: str):
         open_sequence(model(names=(name, "b.png")))
 
 
-def test_a_camera_model_that_is_not_known(model: Make):
+def test_an_unknown_camera_model_is_refused(model: Make):
     with pytest.raises(CalibrationError, match="unknown camera model 'FOV'"):
         open_sequence(model(model="FOV", params=[40.0, 41.0, 16.0, 12.0, 0.5]))
 

@@ -97,7 +97,7 @@ def test_readable_after_each_frame(tmp_path: Path):
             assert len(open_sequence(tmp_path / "out")) == index + 1
 
 
-def test_what_is_there_is_never_overwritten(tmp_path: Path):
+def test_existing_files_are_never_overwritten(tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/thesis.tex").write_text("x")
     with pytest.raises(TopolocError, match=r"is not empty and has thesis\.tex"):
