@@ -89,7 +89,7 @@ def _example(browser: Any, site: str, script: str = "") -> Iterator[Any]:
     page.close()
 
 
-def test_it_loads_and_says_what_is_missing(browser: Any, site: str):
+def test_it_loads_and_names_missing_features(browser: Any, site: str):
     with _example(browser, site) as page:
         page.wait_for_function("!support.textContent.startsWith('Looking')")
         assert "choose a picture" in page.inner_text("#support").lower()
