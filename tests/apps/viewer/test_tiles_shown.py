@@ -128,7 +128,7 @@ def test_an_export_holds_all_of_them(campus: Path):
     )
 
 
-def test_the_commands_show_the_largest_world_and_say_what_is_left_out(
+def test_the_commands_show_the_largest_world_and_list_other_tiles(
     campus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     page = tmp_path / "campus.html"
