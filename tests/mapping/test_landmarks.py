@@ -135,7 +135,7 @@ def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
     return seen, points_img
 
 
-def test_points_are_found_by_descriptor_where_they_must_be():
+def test_points_are_matched_by_descriptor_at_their_projections():
     seen, points_img = observed(np.zeros((60, 2)))
     assert sorted(seen.rows.tolist()) == list(range(60))
     np.testing.assert_allclose(

@@ -47,7 +47,7 @@ def test_angle_is_that_of_the_relative_rotation_up_to_half_a_turn():
         assert distance == pytest.approx(angle, abs=1e-7)
 
 
-def test_a_straight_walk_places_a_node_where_the_threshold_is_passed():
+def test_a_straight_walk_places_a_node_at_each_passed_threshold():
     walk = [moved(0.25 * k) for k in range(9)]
     # 0.5 m is not more than the threshold of 0.5 m
     assert select_node_frames(walk, 0.5, 1.0).tolist() == [0, 3, 6]
