@@ -53,7 +53,7 @@ def test_rotation_drift_is_a_metre():
     assert drift.rotation == pytest.approx(yaw_error / (2 * np.pi * radius / num), rel=0.05)
 
 
-def test_too_short_a_way_has_no_drift_and_unequal_lengths_are_refused():
+def test_too_short_a_path_has_no_drift_and_unequal_lengths_are_refused():
     assert relative_drift(circle(3, 0.5), circle(3, 0.5)) is None
     with pytest.raises(TrajectoryError, match="3 and 4"):
         relative_drift(circle(3), circle(4))

@@ -85,7 +85,7 @@ PLANES = [
 
 
 @pytest.mark.parametrize("plane", PLANES)
-def test_disparity_is_unbiased_and_as_precise_as_it_says(plane: tuple[float, float, float]):
+def test_disparity_is_unbiased_and_as_precise_as_its_sigma(plane: tuple[float, float, float]):
     left, right = rendered_pair(*plane, noise=2.0, seed=3)
     points = random_points(1500)
     disparities, sigmas = matched(left, right, points)

@@ -100,7 +100,7 @@ def test_millimetres_are_taken_by_the_sensors_resolution(
         "no order",
     ],
 )
-def test_data_that_tells_nothing_gives_none(exif: bytes, tmp_path: Path):
+def test_data_without_a_focal_length_gives_none(exif: bytes, tmp_path: Path):
     assert exif_focal_length(_jpeg(tmp_path / "a.jpg", exif), 640, 480) is None
 
 

@@ -28,7 +28,7 @@ def test_frames(kitti: Path):
         sequence[3]
 
 
-def test_colour_pair_where_there_is_no_grey_one(kitti: Path):
+def test_colour_pair_without_a_grey_one(kitti: Path):
     for old, new in (("image_0", "image_2"), ("image_1", "image_3")):
         (kitti / old).rename(kitti / new)
     frame = open_kitti(kitti)[0]
@@ -129,7 +129,7 @@ def test_bad_times(kitti: Path, times: str, says: str):
 
 
 @pytest.mark.parametrize("name", ["times.txt", "calib.txt"])
-def test_what_is_no_text(kitti: Path, name: str):
+def test_binary_files_are_refused(kitti: Path, name: str):
     (kitti / name).write_bytes(b"\xff\xfe\x00\x81" * 9)
     with pytest.raises(RecordingError, match=name):
         open_kitti(kitti)
