@@ -101,7 +101,7 @@ def test_pictures_agree_with_those_of_paths_of_their_own():
     assert np.median(np.abs(baked / np.maximum(reference, 1e-3) - 1.0)) < 0.06
 
 
-def test_light_is_taken_from_the_cache_and_traced_anew_where_that_is_broken(tmp_path: Path):
+def test_light_is_read_from_the_cache_and_traced_again_if_that_is_broken(tmp_path: Path):
     scene = Scene((FLOOR,), Sky(np.ones((16, 32, 3), np.float32)))
     stages: list[int] = []
 
