@@ -107,7 +107,7 @@ def test_an_unknown_kind_is_wrong_usage():
 
 
 @pytest.mark.parametrize("camera", ["1,\n2,3,x", "1\r,2", "1,2,3,4\u2028,5", "9" * 300 + ",1"])
-def test_a_camera_that_is_none_is_quoted_in_one_line(camera: str):
+def test_an_invalid_camera_is_quoted_in_one_line(camera: str):
     with pytest.raises(CalibrationError, match="neither a file nor four numbers") as refusal:
         parse_calibration(camera)
     assert len(str(refusal.value).splitlines()) == 1

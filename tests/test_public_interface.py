@@ -43,7 +43,7 @@ def test_errors_that_public_names_raise_are_of_the_documented_tree():
 @pytest.mark.parametrize(
     "name", ["build_map", "run_slam", "evaluate", "certify", "update", "merge"]
 )
-def test_long_calls_tell_their_progress(name: str):
+def test_long_calls_report_their_progress(name: str):
     assert "progress" in inspect.signature(getattr(topoloc, name)).parameters
 
 
