@@ -25,7 +25,7 @@ _jaxtyped = jaxtyping.jaxtyped
 def check(modules: list[str]) -> None:
     """Check functions, methods and dataclasses of these modules from now on. No module may
     be imported yet."""
-    jaxtyping.jaxtyped = _for_the_hook  # what the hook writes above each definition
+    jaxtyping.jaxtyped = _for_the_hook  # the hook decorates each definition with it
     jaxtyping.install_import_hook(modules, "beartype.beartype")
 
 

@@ -11,7 +11,7 @@ from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.retrieval.vlad import SurfVlad
 
 ELSEWHERE = Rigid3(exp_so3(np.array([0.0, 0.0, 1.0])), np.array([40.0, -15.0, 0.0]))
-"""Where the second room stands, in the world of the first."""
+"""Pose of the second room in the world of the first."""
 
 
 def _moved(node: TopoNode, node_id: int) -> TopoNode:

@@ -12,8 +12,7 @@ import pytest
 
 WIDTHS = (1300, 400)
 _SOFTWARE_3D = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-# Ratio of luminances of every text that is seen to what lies behind it, the lowest first (WCAG 2.2,
-# 1.4.3).
+# Contrast ratio of each visible text and its background, the lowest first (WCAG 2.2, 1.4.3).
 CONTRASTS = """() => {
   const numbers = (colour) => (colour.match(/[\\d.]+/g) ?? []).map(Number);
   const luminance = (rgb) => rgb.slice(0, 3).map((c) => c / 255).map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4))
@@ -34,7 +33,7 @@ CONTRASTS = """() => {
   }
   return found.sort((x, y) => x[0] - y[0]);
 }"""  # noqa: E501
-# What can be used by keyboard and has no name that a screen reader could say.
+# Controls for the keyboard without an accessible name.
 UNNAMED = """() => [...document.querySelectorAll("button, input:not([hidden]), select, canvas[tabindex], textarea")].filter((element) => {
   const named = element.ariaLabel || element.title || element.textContent.trim() || element.labels?.[0]?.textContent.trim();
   return element.checkVisibility() && !named;

@@ -35,7 +35,7 @@ def mjpeg_camera(
                         % (len(jpeg), jpeg)
                     )
                     time.sleep(period_s)
-            except OSError:  # who looked has gone
+            except OSError:  # the client has gone
                 return
             if hangs:
                 ended.wait(20.0)

@@ -37,7 +37,7 @@ def test_a_job_has_no_worse_figure(job: str):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.slow  # tests/test_recordings.py maps and asks the same recordings
+@pytest.mark.slow  # tests/test_recordings.py maps and queries the same recordings
 def test_another_session_in_the_zed_lab(shared: Path):
     done = run("--quick", "--only", "evaluate", "--shared", shared)
     assert done.returncode == 0, done.stdout + done.stderr

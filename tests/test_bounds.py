@@ -56,7 +56,7 @@ class Outer:
         {"inner": Inner(1.0, ())},
     ],
 )
-def test_what_is_within_passes(change: dict[str, Any]):
+def test_values_within_the_bounds_pass(change: dict[str, Any]):
     check_bounds(replace(Outer(), **change))
 
 
@@ -85,7 +85,7 @@ def test_what_is_within_passes(change: dict[str, Any]):
         ({"inner": Inner(pairs=((1.0,),))}, "Outer.inner.pairs: a list of values is expected"),  # type: ignore[arg-type]
     ],
 )
-def test_what_is_not_is_said_with_its_key(change: dict[str, Any], said: str):
+def test_errors_name_the_key(change: dict[str, Any], said: str):
     with pytest.raises(ConfigError) as raised:
         check_bounds(replace(Outer(), **change))
     assert str(raised.value).startswith(said)
@@ -139,7 +139,7 @@ def test_defaults_are_within_their_bounds(table: str):
     check_bounds(config_class(table)())
 
 
-def test_callers_from_python_are_told_too(tiny_recording: Path):
+def test_python_callers_get_the_same_errors(tiny_recording: Path):
     topomap = built_room(tiny_recording)
     nodes = NodeConfig(d_thresh=-1.0)
     with pytest.raises(
@@ -187,7 +187,7 @@ def test_plain_data_becomes_the_dataclass_again():
         ),
     ],
 )
-def test_plain_data_that_is_none_of_it_is_named_by_its_key(data: Any, said: str):
+def test_invalid_plain_data_is_named_by_its_key(data: Any, said: str):
     with pytest.raises(ConfigError) as raised:
         parse_settings(Stored, data, "a")
     assert str(raised.value) == said

@@ -58,7 +58,7 @@ def _run(module: Path, code: str = _CALL, **environment: str) -> tuple[str, str]
     return done.stdout.strip(), done.stderr
 
 
-def test_code_is_kept_beside_the_function_and_read_where_nothing_can_be_written(module: Path):
+def test_code_is_stored_beside_the_function_and_read_from_read_only_folders(module: Path):
     assert _run(module) == ("7.0 0 1", "")
     kept = module / "__pycache__"
     kept.chmod(0o555)
@@ -68,7 +68,7 @@ def test_code_is_kept_beside_the_function_and_read_where_nothing_can_be_written(
         kept.chmod(0o755)
 
 
-def test_where_it_cannot_lie_beside_the_function_it_is_the_users(module: Path):
+def test_code_of_read_only_folders_is_stored_in_the_users_cache(module: Path):
     (module / "__pycache__").write_text("no folder")
     assert _run(module) == ("7.0 0 1", "")
     assert _run(module) == ("7.0 1 0", "")
@@ -77,7 +77,7 @@ def test_where_it_cannot_lie_beside_the_function_it_is_the_users(module: Path):
     )
 
 
-def test_without_any_place_it_is_compiled_each_time_and_said_once(module: Path):
+def test_without_a_writable_folder_it_is_compiled_each_time_with_one_warning(module: Path):
     (module / "__pycache__").write_text("no folder")
     (module / "others").mkdir()
     (module / "others" / "__init__.py").write_text("")
@@ -106,7 +106,7 @@ def test_damaged_code_is_made_again(module: Path, kind: str):
     assert _run(module, XDG_CACHE_HOME="/dev/null") == ("7.0 1 0", "")
 
 
-def test_whether_code_is_kept_can_be_asked(module: Path):
+def test_is_cached_reports_stored_code(module: Path):
     asks = (
         "from topoloc.compiled import is_cached; import own_kernels;"
         " print(is_cached(own_kernels.more))"

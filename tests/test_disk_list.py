@@ -35,7 +35,7 @@ def entries(count: int, frames: list[Frame]) -> list[Entry]:
     st.lists(st.tuples(st.integers(0, 9), st.integers(0, 1000)), max_size=60),
     st.sampled_from([0, 900, 2500, 10**6]),
 )
-def test_it_is_a_list_whatever_lies_on_disk(changes: list[tuple[int, int]], max_bytes: int):
+def test_it_is_a_list_with_any_entries_on_disk(changes: list[tuple[int, int]], max_bytes: int):
     there, plain = (
         DiskList((np.full(100, k) for k in range(10)), max_bytes),
         [np.full(100, k) for k in range(10)],
@@ -52,10 +52,8 @@ def test_it_is_a_list_whatever_lies_on_disk(changes: list[tuple[int, int]], max_
     assert len(there) == 11
 
 
-def test_only_so_much_stays_in_memory():
-    frames = [
-        Frame(str(k), np.zeros(5000)) for k in range(50)
-    ]  # what is referred to does not count
+def test_the_memory_is_limited():
+    frames = [Frame(str(k), np.zeros(5000)) for k in range(50)]  # shared objects do not count
     there = DiskList(entries(50, frames), max_bytes=8_000, shared_objects=frames)
     assert len(there._cache) == 10
     assert there[0].values[0][0] == 0.0
@@ -63,7 +61,7 @@ def test_only_so_much_stays_in_memory():
     assert 0 in there._cache
 
 
-def test_what_was_put_back_is_kept_and_what_it_refers_to_stays_the_same():
+def test_assigned_entries_are_stored_and_shared_objects_stay_the_same():
     frames = [Frame(str(k)) for k in range(5)]
     there = DiskList(entries(5, frames), max_bytes=0, shared_objects=frames)
     entry = there[3]
@@ -74,7 +72,7 @@ def test_what_was_put_back_is_kept_and_what_it_refers_to_stays_the_same():
     assert len(there[3].values) == 2
 
 
-def test_it_is_pickled_as_a_list_and_knows_its_end():
+def test_it_is_pickled_as_a_list_and_has_an_end():
     there = DiskList([np.zeros(5), np.ones(5)], max_bytes=0)
     back = pickle.loads(pickle.dumps(there))
     assert isinstance(back, list)
@@ -84,7 +82,7 @@ def test_it_is_pickled_as_a_list_and_knows_its_end():
             there[row]
 
 
-def test_a_full_disk_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch):
     class Full:
         def execute(self, *_: object) -> None:
             raise sqlite3.OperationalError("database or disk is full")

@@ -126,7 +126,7 @@ def test_every_table_and_column_of_the_map_is_documented():
     ("door", "name"),
     [(door, name) for door in DOORS for name in door.__all__ if name != "__version__"],
 )
-def test_every_public_name_says_what_it_is(door: ModuleType, name: str):
+def test_every_public_name_is_documented(door: ModuleType, name: str):
     public = getattr(door, name)
     assert public.__doc__
     assert not public.__doc__.startswith(f"{name}("), (

@@ -69,7 +69,7 @@ def _centimetres(text: str, before: str) -> list[float]:
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_an_example_is_short_says_how_it_is_run_and_is_tested_here(path: Path):
+def test_an_example_is_short_names_its_command_and_is_tested_here(path: Path):
     text = path.read_text(encoding="utf-8")
     docstring = ast.get_docstring(ast.parse(text))
     assert docstring

@@ -22,7 +22,7 @@ from topoloc.retrieval.shared_vocabulary import shared_vocabulary  # noqa: E402
 KINDS = ("maps", "undo", "manifests", "places", "recordings", "images", "settings")
 KINDS += ("calibrations", "cameras")
 NUM_INPUTS = 24  # of each kind
-# What a reader may do wrong, by seed; the last one is refused as it should be.
+# Faults of a reader, by seed. The last input is refused correctly.
 FAULTS = """
 import os, signal, sys, time
 sys.path.insert(0, {benchmarks!r})
@@ -82,7 +82,7 @@ def test_each_fault_is_found_and_named(tmp_path: Path):
     script = tmp_path / "child.py"
     script.write_text(FAULTS.format(benchmarks=str(BENCHMARKS)))
     limits = Limits(processor_s=6.0, clock_s=60.0, memory_bytes=1_500_000_000)
-    fuzzers = {"faulty": QueryCameras()}  # makes nothing; the child has its own of this name
+    fuzzers = {"faulty": QueryCameras()}  # unused: the child has its own fuzzer of this name
     tally = run_fuzzers([sys.executable, str(script)], fuzzers, range(7), limits=limits)
     assert [(one.seed, one.outcome) for one in tally.findings] == [
         (0, "traceback"),
@@ -107,7 +107,7 @@ def test_an_unknown_kind_is_wrong_usage():
 
 
 @pytest.mark.parametrize("camera", ["1,\n2,3,x", "1\r,2", "1,2,3,4\u2028,5", "9" * 300 + ",1"])
-def test_a_camera_that_is_none_is_quoted_in_one_line(camera: str):
+def test_an_invalid_camera_is_quoted_in_one_line(camera: str):
     with pytest.raises(CalibrationError, match="neither a file nor four numbers") as refusal:
         parse_calibration(camera)
     assert len(str(refusal.value).splitlines()) == 1

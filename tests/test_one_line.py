@@ -90,7 +90,7 @@ def test_every_public_object_is_one_line(room_map: Path):
         assert len(text) < 200, text
 
 
-def test_the_line_says_what_there_is():
+def test_the_line_shows_the_content():
     assert repr(topoloc.Evaluation(MANY)) == "Evaluation(answers=list of 10000)"
     assert repr(topoloc.Evaluation([])) == "Evaluation(answers=[])"
     assert "depth=ndarray of 400" in repr(
@@ -124,7 +124,7 @@ def test_a_type_checker_tells_results_and_frames_apart(tmp_path: Path):
     assert sorted(set(errors)) == ["11", "12"]
 
 
-def test_no_other_public_dataclass_prints_what_it_holds():
+def test_no_other_public_dataclass_prints_its_data():
     """A new dataclass inherits `OneLine`, has its own line, or holds a few numbers and
     joins this list."""
     small = "AtlasConfig GeoPoint GeoPositionPrior Illumination PoseConventions SingleMap"

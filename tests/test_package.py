@@ -23,7 +23,7 @@ from topoloc.apps.cli import COMMANDS, EXAMPLES, PLUGIN_PACKAGES, all_commands, 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("cv2", "faiss", "fastapi", "httpx", "matplotlib", "numba", "numpy", "onnxruntime")
 HEAVY += ("poselib", "pydantic", "torch", "tyro", "uvicorn")
-# What the core runs without: the extras, and the tests' own tools.
+# The core runs without these: the extras and the tools of the tests.
 FOREIGN = (
     "torch",
     "torchvision",
@@ -117,7 +117,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return programs
 
 
-def test_the_wheel_holds_every_module_what_they_read_and_the_licence(wheel: Path):
+def test_the_wheel_contains_each_module_its_data_and_the_licence(wheel: Path):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     files = {
@@ -182,7 +182,7 @@ def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
 
 
 @pytest.mark.parametrize(("command", "distribution"), PLUGIN_PACKAGES.items())
-def test_commands_of_other_distributions_are_named_where_they_are_missing(
+def test_missing_commands_of_other_distributions_are_named(
     installed: Path, command: str, distribution: str
 ):
     answer = _run(installed / "topoloc", command, "lab", "out")

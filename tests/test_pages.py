@@ -54,7 +54,7 @@ def _marked_blocks(page: str, language: str) -> list[str]:
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_every_benchmark_is_on_its_page_and_says_how_it_is_run(script: Path):
+def test_every_benchmark_is_on_its_page_with_its_command(script: Path):
     assert f"`python benchmarks/{script.name}" in _read("benchmarks.md")
     docstring = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8")))
     assert docstring
@@ -98,7 +98,7 @@ def test_public_names_are_in_the_reference_once_each(door: ModuleType):
     assert sorted(described) == sorted(door.__all__)
 
 
-def test_a_public_name_has_one_door():
+def test_a_public_name_is_in_one_module():
     assert set(topoloc.__all__) & set(topoloc.plugin.__all__) == set()
 
 

@@ -85,7 +85,7 @@ def _names_of_core(node: ast.AST) -> list[str]:
 @pytest.mark.parametrize(
     "name", ["build_map", "run_slam", "evaluate", "certify", "update", "merge"]
 )
-def test_long_calls_tell_their_progress(name: str):
+def test_long_calls_report_their_progress(name: str):
     assert "progress" in inspect.signature(getattr(topoloc, name)).parameters
 
 

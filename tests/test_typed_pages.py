@@ -24,7 +24,7 @@ from topoloc.demo.recordings import SHIPPED
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/quickstart.md")
 
-# What a page says -> what is typed: the reader's own folders and images are parts of the demo's.
+# Word on a page -> typed word: the reader's folders and images are parts of the demo's.
 PLACEHOLDERS = {"MAP": "office.topo", "RECORDING": "walk", "FOLDER": "office"}
 NOT_TYPED = {
     "pip install": "fetches packages from an index; the wheels have tests of their own",
@@ -35,7 +35,7 @@ NOT_TYPED = {
     "python benchmarks/": "measures for minutes, on recordings outside the repository",
     "topoloc train": "needs topoloc-training, which the page says; typed by tests/training",
 }
-# Of the others, those of `make test`. The rest is typed by `make test-slow`.
+# Commands typed by `make test`. `make test-slow` types the rest.
 QUICK = ("topoloc build office/", "topoloc localize office.topo", "topoloc evaluate MAP")
 BARRED = (*(set(FOREIGN) - {"matplotlib"}), "topoloc_worlds", "topoloc_training", "topoloc_paper")
 _BAR = f"""

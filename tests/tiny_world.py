@@ -113,7 +113,7 @@ def render(
         axes_world = np.stack([np.cross(panel.right, panel.down), panel.right, panel.down])
         towards, to_right, to_down = (
             axes_world @ world_from_cam.rotation
-        ) @ rays  # what a metre of depth adds along each axis
+        ) @ rays  # steps along each axis per metre of depth
         begin = axes_world @ (world_from_cam.translation - panel.centre)
         with np.errstate(divide="ignore"):
             z = -begin[0] / towards

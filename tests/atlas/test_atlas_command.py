@@ -76,7 +76,7 @@ def test_the_history_is_that_of_each_tile(
     assert "tile room" in said.out
 
 
-def test_a_history_ends_where_the_store_is_silent(
+def test_a_history_ends_if_the_store_is_silent(
     atlas: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     asked = list[str]()
@@ -111,7 +111,7 @@ def test_pictures_are_localized_in_their_tiles(
     assert "tile other" in capsys.readouterr().out
 
 
-def test_near_leaves_tiles_out_that_are_known_to_lie_elsewhere(
+def test_near_excludes_tiles_known_to_be_elsewhere(
     own_atlas: Path,
     room_map: Path,
     of_both: Path,
@@ -203,7 +203,7 @@ def test_known_failures_are_one_line(
         (["evaluate", "ATLAS", "PICTURES", "--tile", "room", "--report", "x.html"], "--report"),
     ],
 )
-def test_wrong_usage_is_said(
+def test_wrong_usage_is_an_error(
     args: list[str], said: str, own_atlas: Path, room_map: Path, of_both: Path, complaint: Complaint
 ):
     paths = {"ATLAS": own_atlas, "MAP": room_map, "PICTURES": of_both}

@@ -61,7 +61,7 @@ def test_two_tiles_of_one_id_are_refused(somewhere: str, room_map: Path, other_m
     assert Atlas.open(somewhere).manifest.serial == 1
 
 
-def test_an_atlas_that_is_made_where_there_is_none(somewhere: str, room_map: Path, other_map: Path):
+def test_an_atlas_is_created_on_request(somewhere: str, room_map: Path, other_map: Path):
     with pytest.raises(AtlasError, match="is no atlas"):
         add_tiles(somewhere, new_tiles([str(room_map)]))
     assert add_tiles(somewhere, new_tiles([str(room_map)]), creates=True).serial == 1
@@ -69,7 +69,7 @@ def test_an_atlas_that_is_made_where_there_is_none(somewhere: str, room_map: Pat
     assert _tiles(somewhere) == ["other", "room"]
 
 
-def test_what_was_made_of_the_same_is_no_other_tile(
+def test_a_tile_with_the_same_recipe_is_the_same_tile(
     somewhere: str, room_map: Path, other_map: Path
 ):
     made = NewTile("room", room_map, "room", recipe="ab" * 32)
@@ -86,7 +86,9 @@ def test_what_was_made_of_the_same_is_no_other_tile(
     )
 
 
-def test_what_a_killed_writer_left_half_goes(room_map: Path, other_map: Path, tmp_path: Path):
+def test_partial_files_of_a_killed_writer_are_removed(
+    room_map: Path, other_map: Path, tmp_path: Path
+):
     where = tmp_path / "campus"
     create_atlas(str(where), new_tiles([str(room_map)]))
     left = where / "tiles" / ".hall-0123456789ab.topo.0123456789abcdef.part"
@@ -95,9 +97,7 @@ def test_what_a_killed_writer_left_half_goes(room_map: Path, other_map: Path, tm
     assert not left.exists()
 
 
-def test_whoever_has_opened_an_atlas_keeps_its_tiles(
-    somewhere: str, room_map: Path, other_map: Path
-):
+def test_an_open_atlas_keeps_its_tiles(somewhere: str, room_map: Path, other_map: Path):
     create_atlas(somewhere, new_tiles([str(room_map)], "hall"))
     before = Atlas.open(somewhere)
     add_tiles(somewhere, new_tiles([str(other_map)], "hall"), replaces=True)
@@ -106,7 +106,7 @@ def test_whoever_has_opened_an_atlas_keeps_its_tiles(
     assert after.map_path(after.tile("hall")).read_bytes() == other_map.read_bytes()
 
 
-def test_files_that_nobody_names_go_after_their_time(
+def test_unnamed_files_are_removed_after_their_time(
     room_map: Path, other_map: Path, tmp_path: Path
 ):
     where = tmp_path / "campus"
@@ -215,7 +215,7 @@ def test_a_file_that_is_not_the_one_that_was_added_is_named(own_atlas: Path):
     assert read.find_problem("other") is None
 
 
-def test_what_is_no_atlas_is_said_to_be_none(tmp_path: Path, room_map: Path):
+def test_invalid_atlases_and_tiles_are_refused(tmp_path: Path, room_map: Path):
     with pytest.raises(AtlasError, match="is no atlas"):
         Atlas.open(str(tmp_path))
     with pytest.raises(AtlasError, match="is no atlas"):

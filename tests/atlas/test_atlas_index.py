@@ -35,7 +35,7 @@ def test_tiles_are_ranked_by_their_most_similar_place():
     )
 
 
-def test_the_last_kind_counts_and_tiles_without_it_stay_as_far_behind_as_they_were():
+def test_the_last_feature_type_ranks_and_tiles_without_it_keep_their_gap():
     along = np.eye(4, dtype=np.float32)
 
     def like(cosine, axis):

@@ -104,7 +104,7 @@ def test_features_are_extracted_once_for_all_tiles(atlas: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize(("min_similarity", "num_asked"), [(-1.0, 2), (2.0, 1)])
-def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all_means(
+def test_without_a_similar_tile_only_the_likeliest_is_searched_exhaustively(
     atlas: Path, monkeypatch: pytest.MonkeyPatch, min_similarity: float, num_asked: int
 ):
     asked = list[str]()
@@ -121,7 +121,7 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
     assert len(asked) == num_asked
 
 
-def test_two_tiles_that_know_the_place_as_well_are_both_named(own_atlas: Path, room_map: Path):
+def test_two_equally_likely_tiles_are_both_named(own_atlas: Path, room_map: Path):
     """Two buildings have the same room, and no image can distinguish them."""
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin"))
     result = _localizer(own_atlas).localize(unseen_views()[0][0], CAMERA)
@@ -133,7 +133,7 @@ def test_two_tiles_that_know_the_place_as_well_are_both_named(own_atlas: Path, r
     assert result_from_json(result.to_json("view")).alternatives[0].tile in ("room", "twin")  # pyright: ignore
 
 
-def test_a_look_alike_that_cannot_come_near_is_left_at_that(
+def test_a_similar_tile_that_cannot_rival_the_pose_is_skipped(
     atlas: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """A similar tile that cannot rival the pose is neither searched nor named."""
@@ -151,7 +151,7 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(
     assert asked == ["surf"], "the tile that answers, not the other one"
 
 
-def test_a_twin_that_is_asked_last_is_heard(own_atlas: Path, room_map: Path):
+def test_a_similar_tile_that_is_searched_last_is_a_rival(own_atlas: Path, room_map: Path):
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin"))
     result = _localizer(own_atlas, Wide(num_glanced=1)).localize(unseen_views()[0][0], CAMERA)
     assert isinstance(result, NotLocalized)
@@ -165,7 +165,7 @@ def test_two_tiles_of_one_world_agree(own_atlas: Path, room_map: Path):
     assert isinstance(_localizer(own_atlas).localize(unseen_views()[0][0], CAMERA), Localization)
 
 
-def test_georeferenced_tiles_agree_and_say_where_in_the_atlas(
+def test_georeferenced_tiles_agree_and_give_the_pose_in_the_atlas(
     own_atlas: Path, room_map: Path, tmp_path: Path
 ):
     from dataclasses import replace
@@ -205,13 +205,13 @@ def test_a_tile_that_cannot_be_read_leaves_the_rest(own_atlas: Path, harm: str):
     of_other = localizer.localize(unseen_views(seed=1)[1][0], CAMERA)
     assert of_other.localized == harm.startswith(
         "places"
-    )  # whose places cannot be ranked is asked after the others
+    )  # a tile without readable descriptors is searched last
     assert len(said) == 1
     assert said[0].startswith("tile other ")
     assert str(path.name) in said[0]
 
 
-def test_where_the_likely_tile_is_gone_another_one_refuses(own_atlas: Path):
+def test_if_the_likely_tile_is_missing_another_one_refuses(own_atlas: Path):
     """By default, a tile with a clear lead would be searched alone."""
     (own_atlas / Atlas.open(str(own_atlas)).tile("room").map.name).unlink()
     said = list[str]()
@@ -229,7 +229,7 @@ def test_no_tile_left_is_a_failure(own_atlas: Path):
         _localizer(own_atlas).localize(unseen_views()[0][0], CAMERA)
 
 
-def test_one_tile_can_be_asked_alone_near_a_pose(asked: Localizer):
+def test_one_tile_can_be_queried_alone_near_a_pose(asked: Localizer):
     image, world_from_cam = unseen_views()[0]
     near = asked.localize(image, CAMERA, world_from_cam, tile_id="room")
     assert isinstance(near, Localization)
@@ -240,7 +240,7 @@ def test_one_tile_can_be_asked_alone_near_a_pose(asked: Localizer):
         asked.localize(image, CAMERA, tile_id="attic")
 
 
-def test_tiles_are_closed_where_memory_is_little(atlas: Path):
+def test_tiles_are_closed_if_memory_is_limited(atlas: Path):
     maps = MapCache([], Localizer, 1)
     localizer = Localizer(Atlas.open(str(atlas)), maps=maps)
     for seed in (0, 1, 0):
@@ -248,6 +248,6 @@ def test_tiles_are_closed_where_memory_is_little(atlas: Path):
         assert maps.num_open <= 1
 
 
-def test_time_ends_the_search_but_not_before_a_tile_was_asked(asked: Localizer):
+def test_the_time_limit_ends_the_search_after_at_least_one_tile(asked: Localizer):
     result = asked.localize(unseen_views(seed=2)[0][0], CAMERA, max_ms=0.001)
     assert result.provenance.tile is not None

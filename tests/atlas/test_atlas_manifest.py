@@ -39,7 +39,7 @@ def _tile(name: str, georeference: Georeference | None = None) -> Tile:
     )
 
 
-def test_what_is_written_is_read():
+def test_a_written_manifest_is_read():
     turn = Rigid3(exp_so3(np.array([0.0, 0.0, 0.3])), np.array([5.0, 6.0, 7.0]))
     placed = _tile("b", Georeference(GeoPoint(50.0, 4.0, 30.0), turn, "origin"))
     written = Manifest().with_tiles(

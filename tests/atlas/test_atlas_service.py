@@ -88,7 +88,7 @@ def _geopose(client: TestClient, queries: Path, *readings: dict[str, float]) -> 
     return client.post("/localize/geopose", json={"id": "1", "sensorReadings": said})
 
 
-def test_geopose_asks_the_atlas_and_only_tiles_near_the_device(
+def test_geopose_searches_only_tiles_near_the_device(
     client: TestClient, own_atlas: Path, room_map: Path, queries: Path
 ):
     assert _geopose(client, queries).status_code == 409

@@ -107,7 +107,7 @@ def test_each_recording_joins_its_tile_as_it_would_join_the_map(
     assert (own_atlas / "atlas.json").read_bytes() == before
 
 
-def test_a_tile_that_is_named_is_not_sought(
+def test_a_named_tile_is_used_without_a_search(
     own_atlas: Path, sessions: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ):
     """A recording of another tile does not fit the named one. The other recordings continue."""
@@ -133,7 +133,7 @@ def test_a_tile_that_is_named_is_not_sought(
         (["MAP", "SEQ", "--ray", "local"], "--tile and --ray need an atlas", 2),
     ],
 )
-def test_what_cannot_be_meant_is_said(
+def test_invalid_arguments_are_one_line(
     args: list[str],
     said: str,
     status: int,
@@ -146,7 +146,7 @@ def test_what_cannot_be_meant_is_said(
     assert said in complaint("update", *(paths.get(arg, arg) for arg in args), status=status)
 
 
-def test_who_replaced_the_tile_meanwhile_is_not_overwritten(
+def test_a_tile_replaced_meanwhile_is_not_overwritten(
     somewhere: str, room_map: Path, other_map: Path
 ):
     create_atlas(somewhere, [NewTile("hall", room_map, "campus", "ab" * 32)])
@@ -167,9 +167,7 @@ def test_who_replaced_the_tile_meanwhile_is_not_overwritten(
     assert _notes(somewhere, "hall") == ["try 2"]
 
 
-def test_others_who_are_always_faster_are_left_alone(
-    somewhere: str, room_map: Path, tmp_path: Path
-):
+def test_always_faster_writers_end_the_edit(somewhere: str, room_map: Path, tmp_path: Path):
     create_atlas(somewhere, new_tiles([str(room_map)], "hall"))
     theirs = Path(shutil.copy(room_map, tmp_path / "theirs.topo"))
 
@@ -184,7 +182,7 @@ def test_others_who_are_always_faster_are_left_alone(
     assert Atlas.open(somewhere).tile("hall").num_nodes > 0
 
 
-def test_joins_world_and_recipe_stay_what_they_are(somewhere: str, room_map: Path, other_map: Path):
+def test_joins_world_and_recipe_stay(somewhere: str, room_map: Path, other_map: Path):
     create_atlas(
         somewhere,
         [NewTile("hall", room_map, "hall", "ab" * 32), NewTile("yard", other_map, "yard")],
@@ -202,7 +200,7 @@ def test_joins_world_and_recipe_stay_what_they_are(somewhere: str, room_map: Pat
     assert tile.map.sha256 != before.by_id["hall"].map.sha256
 
 
-def test_nothing_is_left_and_nothing_changed_where_it_fails(
+def test_a_failure_leaves_no_file_and_changes_nothing(
     own_atlas: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     scratch = tmp_path / "scratch"
@@ -233,9 +231,7 @@ def _answers(**counts: int) -> list[Localization]:
     return [one(tile_id) for tile_id, number in counts.items() for _ in range(number)]
 
 
-def test_a_recording_is_of_the_tile_that_most_pictures_name_or_of_none(
-    own_atlas: Path, room_map: Path
-):
+def test_a_recording_belongs_to_the_tile_of_most_images_or_to_none(own_atlas: Path, room_map: Path):
     add_tiles(str(own_atlas), [NewTile("annex", room_map, "room")])
     tiles = Atlas.open(str(own_atlas)).manifest.by_id
 

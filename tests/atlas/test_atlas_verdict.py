@@ -81,14 +81,14 @@ def _answer(result: Localization | NotLocalized) -> Answer:
     return Answer(search, hypothesis, result, [(result, NO_INLIERS)], [hypothesis])
 
 
-def test_the_only_tile_that_vouches_answers():
+def test_the_only_tile_with_a_pose_localizes():
     result = _merge((_tile("a"), NotLocalized("not_in_map")), (_tile("b"), _pose(STRONG)))
     assert isinstance(result, Localization)
     assert result.provenance.tile == "b"
     assert result.probability == pytest.approx(0.95)
 
 
-def test_a_pose_with_far_more_for_it_leads_and_pays_for_its_rival():
+def test_a_pose_with_far_more_evidence_leads_with_a_lower_probability():
     rivals = [(_tile("a"), _pose(WEAK)), (_tile("b"), _pose(STRONG))]
     for found in (rivals, rivals[::-1]):
         result = _merge(*found)
@@ -98,7 +98,7 @@ def test_a_pose_with_far_more_for_it_leads_and_pays_for_its_rival():
 
 
 @pytest.mark.parametrize("coarse", [-1, 1])
-def test_two_poses_with_as_much_for_them_are_both_named(coarse: int):
+def test_two_poses_with_equal_evidence_are_both_named(coarse: int):
     result = _merge((_tile("a"), _pose(FAIR)), (_tile("b"), _pose(FAIR, x=3.0)), coarse=coarse)
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
@@ -126,7 +126,7 @@ def test_tiles_that_lie_in_the_atlas_are_compared_there():
     assert isinstance(_merge((a, _pose(FAIR, x=2.0)), (b, _pose(FAIR, x=2.0))), NotLocalized)
 
 
-def test_a_refusal_is_that_of_the_tile_that_knows_most():
+def test_a_refusal_is_that_of_the_tile_with_most_inliers():
     few, more = NotLocalized("too_few_matches"), NotLocalized("not_in_map", num_inliers=9)
     result = _merge(
         (_tile("a"), few),

@@ -135,7 +135,7 @@ def test_few_tiles_that_come_are_compared_and_many_become_a_shard(campus: Campus
     assert campus.read == []
 
 
-def test_a_small_shard_is_made_one_with_what_comes(campus: Campus, monkeypatch: pytest.MonkeyPatch):
+def test_a_small_shard_is_merged_with_new_tiles(campus: Campus, monkeypatch: pytest.MonkeyPatch):
     campus.open()
     monkeypatch.setattr(index_files, "SHARD_DESCRIPTORS", 10_000)
     campus.add(*(f"many{number}" for number in range(10)))
@@ -167,7 +167,7 @@ def test_tiles_that_are_removed_or_replaced_are_not_named(campus: Campus):
     assert len(campus.read) == 7
 
 
-def test_only_tiles_among_those_asked_are_named(campus: Campus):
+def test_only_tiles_in_the_given_set_are_ranked(campus: Campus):
     opened = campus.open()
     for among in ({"t01"}, {"t01", "t02", "t07"}, set(campus.vectors) - {"t04"}, set()):
         asked = campus.vectors["t04"][3]
@@ -195,7 +195,7 @@ def test_a_damaged_file_is_made_anew_with_one_note(campus: Campus, damage: str):
     assert campus.read == []
 
 
-def test_where_nothing_can_be_written_the_index_stays_in_memory(campus: Campus):
+def test_without_a_writable_folder_the_index_stays_in_memory(campus: Campus):
     campus.folder.parent.joinpath("file").write_bytes(b"")
     campus.folder = campus.folder.parent / "file" / "index"
     opened = campus.open()

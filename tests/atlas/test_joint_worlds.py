@@ -68,7 +68,7 @@ def _manifest(joins: list[Join], **worlds: str) -> Manifest:
     )
 
 
-def test_three_worlds_in_a_loop_share_what_does_not_close():
+def test_three_worlds_in_a_loop_share_the_closing_error():
     joins = [_join("a", "b", _off(1)), _join("b", "c", _off(2)), _join("a", "c", _off(3))]
     adjusted, places = adjust_joins(joins, EACH_ITS_OWN, {})
     misses = []
@@ -86,7 +86,7 @@ def test_three_worlds_in_a_loop_share_what_does_not_close():
     assert max(misses) < 0.08
 
 
-def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
+def test_a_join_that_contradicts_more_images_is_dropped():
     wrong = Rigid3(np.eye(3), np.array([5.0, 0.0, 0.0]))
     joins = [
         _join("a", "b"),
@@ -109,14 +109,14 @@ def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
         )
 
 
-def test_uncertainty_grows_with_the_way():
+def test_uncertainty_grows_along_the_path():
     _, places = adjust_joins([_join("a", "b"), _join("b", "c"), _join("c", "d")], EACH_ITS_OWN, {})
     traces = [float(np.trace(places[name].covariance)) for name in "abcd"]
     assert traces[0] == 0.0
     assert traces == sorted(traces)
 
 
-def test_joins_do_not_move_what_knows_its_place_on_earth():
+def test_joins_do_not_move_georeferenced_worlds():
     """Georeferences place b and d 1 km apart. Joins that connect them by c are wrong, so the weaker
     join is dropped."""
     on_earth: Mapping[str, Rigid3] = {
@@ -139,7 +139,7 @@ def test_tiles_of_one_world_are_joined_together():
     way = manifest.by_id["b"].from_world_of(manifest.by_id["c"])
     assert way is not None
     assert np.allclose(way.matrix(), (WORLDS["a"] @ WORLDS["c"].inverse()).matrix(), atol=1e-9)
-    assert _manifest([_join("a", "b")], a="house", b="house").joins == ()  # which know it without
+    assert _manifest([_join("a", "b")], a="house", b="house").joins == ()  # one world needs no join
 
 
 def test_one_tile_on_earth_is_enough():
@@ -166,7 +166,7 @@ def test_one_tile_on_earth_is_enough():
     assert not np.isnan(manifest.geo_boxes[0]).any()
 
 
-def test_what_is_written_is_read():
+def test_written_joins_are_read():
     wrong = Rigid3(np.eye(3), np.array([5.0, 0.0, 0.0]))
     written = _manifest([_join("a", "b", _off(4)), _join("b", "c"), _join("a", "c", wrong, 5)])
     read = Manifest.from_bytes(written.to_bytes(), "here")

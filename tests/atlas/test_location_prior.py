@@ -79,7 +79,7 @@ def test_the_date_line_is_no_border():
     assert distances_to_boxes(GeoPositionPrior(-17.0, 0.0, 1.0), boxes)[0] > 1e7
 
 
-def test_only_tiles_that_are_known_to_lie_elsewhere_are_out_of_reach():
+def test_only_tiles_with_a_known_place_are_out_of_reach():
     manifest = _manifest(
         _tile("here", GeoPoint(50.0, 4.0, 0.0)),
         _tile("far", GeoPoint(50.1, 4.0, 0.0)),
@@ -121,7 +121,7 @@ def test_a_pose_is_brought_into_the_worlds_of_the_tiles_in_reach():
     )
 
 
-def test_what_is_no_place_is_refused():
+def test_an_invalid_place_is_refused():
     for text in ("50,4", "north", "50,4,-1", "50,4,nan", "91,4,10", "nan,4,10", "50,4,inf"):
         with pytest.raises(AtlasError):
             GeoPositionPrior.parse(text)
@@ -132,7 +132,7 @@ def test_what_is_no_place_is_refused():
         WorldPositionPrior("a", Rigid3.identity(), 0.0)
 
 
-def test_a_picture_is_asked_only_of_tiles_in_reach(atlas: Path):
+def test_an_image_is_localized_only_in_tiles_in_reach(atlas: Path):
     localizer = Localizer(Atlas.open(str(atlas)))
     image, world_from_cam = unseen_views()[0]
     near = localizer.near(WorldPositionPrior("room", world_from_cam, 5.0)).localize(image, CAMERA)
@@ -150,4 +150,4 @@ def test_a_picture_is_asked_only_of_tiles_in_reach(atlas: Path):
     assert "no tile lies within 5 m of 0, 0, 500 in the world room" in nowhere.detail
     assert isinstance(
         localizer.localize(image, CAMERA), Localization
-    )  # the one that it came from asks all as before
+    )  # the original localizer still searches all tiles

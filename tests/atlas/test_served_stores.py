@@ -151,7 +151,7 @@ def test_tiles_are_closed_beyond_the_budget(in_memory: str, queries: Path):
             assert maps.num_open == 1
 
 
-def test_what_is_written_to_the_store_is_noticed(
+def test_changes_of_the_store_are_noticed(
     store: str, room_map: Path, queries: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(query_handler, "POLL_INTERVAL_S", 0.1)
@@ -165,7 +165,7 @@ def test_what_is_written_to_the_store_is_noticed(
         assert _asked(client, "/v1/localize", queries)["map"] == "hall"
 
 
-def test_a_look_reads_no_manifest_that_it_knows(in_memory: str, monkeypatch: pytest.MonkeyPatch):
+def test_polling_does_not_read_a_known_manifest(in_memory: str, monkeypatch: pytest.MonkeyPatch):
     maps, read = MapCache([in_memory], Localizer, 1), list[str]()
     get = type(ObjectStore(in_memory)._objects).get
     monkeypatch.setattr(
@@ -198,7 +198,7 @@ def silent_tiles(in_memory: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[th
     speaks.set()
 
 
-def test_a_silent_store_holds_nobody_else_up(
+def test_a_silent_store_blocks_no_other_client(
     in_memory: str, silent_tiles: threading.Event, room_map: Path, tmp_path: Path, queries: Path
 ):
     lone = tmp_path / "lone.topo"
@@ -234,7 +234,7 @@ def test_a_tile_that_comes_late_is_waited_for(
         assert time.monotonic() - start >= 0.9
 
 
-def test_what_was_opened_answers_while_the_store_is_gone(
+def test_open_tiles_localize_while_the_store_is_gone(
     in_memory: str, queries: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     monkeypatch.setattr(query_handler, "POLL_INTERVAL_S", 0.02)
@@ -285,7 +285,7 @@ def test_a_missing_or_rotten_tile_is_named_and_the_others_answer(
         assert _asked(client, "/v1/localize", queries)["map"] == "room"
 
 
-def test_a_tile_is_fetched_once_for_all_who_ask(in_memory: str, silent_tiles: threading.Event):
+def test_a_tile_is_fetched_once_for_all_clients(in_memory: str, silent_tiles: threading.Event):
     atlas, fetches = Atlas.open(in_memory), TileFetcher(30.0)
     awaited = list[TilePending]()
     for _ in range(3):
@@ -299,7 +299,7 @@ def test_a_tile_is_fetched_once_for_all_who_ask(in_memory: str, silent_tiles: th
     assert fetches.path(atlas, atlas.tile("room")) == path
 
 
-def test_so_many_tiles_of_one_store_come_at_a_time(
+def test_the_number_of_parallel_fetches_is_limited(
     in_memory: str, silent_tiles: threading.Event, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(tile_fetcher, "_MAX_CONCURRENT_FETCHES", 1)
@@ -312,7 +312,7 @@ def test_so_many_tiles_of_one_store_come_at_a_time(
         fetches.path(atlas, atlas.tile("other"))
 
 
-def test_what_is_no_atlas_is_not_served(
+def test_invalid_sources_are_not_served(
     in_memory: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     for where, said in (
@@ -327,7 +327,7 @@ def test_what_is_no_atlas_is_not_served(
         MapCache([in_memory], Localizer, 1)
 
 
-def test_a_cache_folder_that_cannot_be_written_is_said(
+def test_a_read_only_cache_folder_is_an_error(
     in_memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     (tmp_path / "file").write_text("no folder")

@@ -76,7 +76,7 @@ def test_an_edit_of_a_tile_is_that_of_its_map_and_is_taken_back(
     assert _bytes(own_atlas, "other") == other
 
 
-def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(
+def test_all_tiles_are_pruned_and_a_failing_one_stays(
     own_atlas: Path, capsys: pytest.CaptureFixture[str]
 ):
     atlas = Atlas.open(str(own_atlas))
@@ -90,7 +90,7 @@ def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(
     assert captured.err.count("\n") == 1
 
 
-def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
+def test_a_damaged_kept_file_does_not_stop_edits_of_other_tiles(
     own_atlas: Path, complaint: Complaint
 ):
     Atlas.open(str(own_atlas)).edit("room", _note)
@@ -122,7 +122,7 @@ def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
         (["follow", "ATLAS", "0", "--ros"], "robots need poses of one world", 2),
     ],
 )
-def test_what_cannot_be_meant_is_said(
+def test_invalid_arguments_are_one_line(
     args: list[str],
     said: str,
     status: int,

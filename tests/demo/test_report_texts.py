@@ -41,12 +41,12 @@ def _row(
     ],
     ids=["as by day", "some lost", "all lost", "one wrong"],
 )  # fmt: skip
-def test_the_cost_of_the_night_is_told_as_it_is(night: dict[str, Any], said: str):
+def test_the_errors_by_night_are_reported_as_measured(night: dict[str, Any], said: str):
     assert said in describe_night({"recordings": [_row("day", 20, 20), night]})
 
 
 @pytest.mark.parametrize(("false", "said"), [(0, "none gets a pose"), (2, "2 wrongly get a pose")])
-def test_wrong_acceptances_are_told(false: int, said: str):
+def test_wrong_acceptances_are_reported(false: int, said: str):
     evaluation = {
         "num_elsewhere": 30,
         "recordings": [_row("day", 20, 20), _row("elsewhere", 0, 0, false, 30)],

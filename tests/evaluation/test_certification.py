@@ -30,7 +30,7 @@ from topoloc.recordings.open import open_sequence
 
 
 @given(num=st.integers(1, 400), share=st.floats(0, 1), confidence=st.sampled_from([0.9, 0.95]))
-def test_at_the_bound_so_few_wrong_ones_are_improbable(num: int, share: float, confidence: float):
+def test_at_the_bound_few_wrong_poses_are_improbable(num: int, share: float, confidence: float):
     num_wrong = int(share * (num - 1))
     bound = max_share(num_wrong, num, confidence)
     assert binom.cdf(num_wrong, num, bound) == pytest.approx(1.0 - confidence, abs=1e-6)
@@ -57,7 +57,7 @@ def test_the_threshold_is_the_least_that_keeps_the_limit(worst: list[float], lim
     assert found == 0.5 or max_share(pieces.num_wrong(below), len(worst), 0.95) > limit
 
 
-def test_the_promise_holds_on_answers_that_it_did_not_see():
+def test_the_certificate_holds_on_new_results():
     """In 1,000 maps the error rate falls with p. At most 5 % of the certificates may fail."""
     random, num_broken = np.random.default_rng(5), 0
     for _ in range(1000):
@@ -75,7 +75,7 @@ def test_a_walk_that_comes_back_gives_no_new_pieces():
     assert len(set(numbers.tolist())) == 6
 
 
-def test_images_that_look_alike_are_one_piece():
+def test_similar_images_are_one_piece():
     random = np.random.default_rng(1)
     looks = random.normal(size=(3, 1024))
     looks /= np.linalg.norm(looks, axis=1, keepdims=True)

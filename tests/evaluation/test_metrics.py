@@ -99,7 +99,7 @@ def test_times_are_medians_over_all_queries():
     [[lost("f", 0.0)], [elsewhere("moon", accepted=False)]],
     ids=["none localized", "no truth"],
 )
-def test_what_is_not_known_is_null_and_never_nan(answers: list):
+def test_unknown_values_are_null_and_never_nan(answers: list):
     evaluation = summarize(answers)
     assert evaluation["median_translation_m"] is None
     assert evaluation["median_rotation_deg"] is None

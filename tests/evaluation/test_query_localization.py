@@ -25,7 +25,7 @@ def views(tmp_path: Path) -> Path:
     return write_pictures(tmp_path / "views", unseen_views()[:3])
 
 
-def test_every_frame_with_truth_is_asked_and_told_of(localizer: Localizer, views: Path):
+def test_every_frame_with_truth_is_queried_with_progress(localizer: Localizer, views: Path):
     (views / "truth.tum").write_text(
         "\n".join((views / "truth.tum").read_text().splitlines()[:2]) + "\n"
     )
@@ -71,7 +71,7 @@ def test_images_from_elsewhere_have_no_truth(localizer: Localizer, views: Path):
     assert told[-1] == ("views (out of map)", 3, 3)
 
 
-def test_without_truth_or_calibration_nothing_is_asked(localizer: Localizer, views: Path):
+def test_without_truth_or_calibration_nothing_is_queried(localizer: Localizer, views: Path):
     (views / "camera.json").unlink()
     with pytest.raises(CalibrationError, match=r"view00\.png: no calibration"):
         localize_queries(localizer, open_sequence(views))

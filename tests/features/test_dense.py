@@ -26,14 +26,14 @@ def _points(num: int) -> np.ndarray:
     return np.random.default_rng(4).uniform([20.0, 20.0], [107.0, 75.0], (num, 2))
 
 
-def test_points_agree_where_they_are_seen_whatever_the_length_of_the_descriptors():
+def test_points_agree_at_their_pixels_for_any_length_of_the_descriptors():
     planes, points = _scene(), _points(200)
     brighter = SingleLevelDescriptors(7.0 * planes, STRIDE)
     assert brighter.check_agreement(points, _of_points(planes, points)).all()
 
 
 @pytest.mark.parametrize(("steps", "share"), [(1, 1.0), (2, 0.0), (4, 0.0)])
-def test_one_grid_step_is_forgiven_and_no_more(steps: int, share: float):
+def test_one_grid_step_is_tolerated_and_no_more(steps: int, share: float):
     planes, points = _scene(), _points(200)
     descriptors = _of_points(planes, points + np.array([steps * STRIDE, 0.0]))
     assert (

@@ -35,7 +35,7 @@ def darkened(image: np.ndarray, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["surf", "sift"])
 @pytest.mark.parametrize("normalization", list(NORMALIZATIONS))
-def test_every_kind_and_normalisation(kind, normalization):
+def test_every_feature_type_and_normalisation(kind, normalization):
     config = FeatureConfig(kind=kind, normalization=normalization, max_features=300)
     features = extract_features(picture(), config)
     assert 100 < len(features) <= 300

@@ -16,7 +16,7 @@ from topoloc.features.feature_types import (
 
 
 @pytest.mark.parametrize("kind", FEATURE_TYPES.values(), ids=lambda kind: kind.name)
-def test_what_a_kind_says_of_itself_is_so(
+def test_the_declared_properties_of_a_type_are_right(
     kind: FeatureType, shared_picture: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     if kind.network is not None:  # of a network that stands for the real one
@@ -28,13 +28,13 @@ def test_what_a_kind_says_of_itself_is_so(
     assert 100 < len(features) <= 200
     assert features.descriptors.shape[1] == kind.descriptor_size
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-3)
-    # what a map file clips is rare: the kind's scale suits its descriptors
+    # few values are clipped in a map file: the scale of the type suits its descriptors
     assert np.mean(np.abs(features.descriptors) * kind.descriptor_scale > 127) < 1e-3
     assert (np.ptp(features.sizes_px) > 0) == kind.has_scale
     assert (np.ptp(features.angles) > 0) == kind.has_angle
 
 
-def test_an_unknown_kind_is_told_with_those_that_there_are():
+def test_an_unknown_type_is_an_error_that_lists_all_types():
     with pytest.raises(FeatureTypeError, match="'orb'; there are surf, sift"):
         find_feature_type("orb")
 

@@ -39,7 +39,7 @@ def _bumps(centres: list[tuple[float, float]], height: int, width: int) -> np.nd
     return np.max(bumps, axis=0).astype(np.float32)
 
 
-# where the scores are highest
+# at the highest scores
 
 
 def test_key_points_lie_at_the_tops_to_a_fraction_of_a_pixel():
@@ -52,7 +52,7 @@ def test_key_points_lie_at_the_tops_to_a_fraction_of_a_pixel():
     np.testing.assert_allclose(found[order], [0.9, 0.8, 0.7, 0.6], atol=0.06)
 
 
-def test_none_lies_at_the_border_or_in_what_continues_the_picture():
+def test_no_key_point_lies_at_the_border_or_in_the_padding():
     scores = _bumps(
         [
             (30.0, 20.0),
@@ -69,7 +69,7 @@ def test_none_lies_at_the_border_or_in_what_continues_the_picture():
     )
     points, _ = find_maxima(
         scores, 48, 64, 4, np.float32(0.1)
-    )  # the picture ends at row 48, the scores do not
+    )  # the image ends at row 48, the scores do not
     assert (
         len(find_maxima(scores, 8, 64, 4, np.float32(0.1))[0])
         == len(find_maxima(scores, 48, 7, 4, np.float32(0.1))[0])
@@ -80,7 +80,7 @@ def test_none_lies_at_the_border_or_in_what_continues_the_picture():
     )
 
 
-def test_weak_ones_and_those_beside_stronger_ones_are_none_and_of_equals_there_is_one():
+def test_weak_maxima_and_neighbours_of_stronger_ones_are_dropped():
     scores = np.zeros((32, 32), np.float32)
     scores[10, 10], scores[10, 12], scores[8, 11] = (
         0.5,
@@ -94,7 +94,7 @@ def test_weak_ones_and_those_beside_stronger_ones_are_none_and_of_equals_there_i
     np.testing.assert_array_equal(found, np.array([0.5, 0.2], np.float32))
 
 
-def test_key_points_are_what_no_window_exceeds():
+def test_key_points_are_the_maxima_of_their_windows():
     """Compare with all windows of random scores. Few values make many of them equal."""
     scores = np.random.default_rng(7).integers(0, 30, (40, 56)).astype(np.float32) / 30
     pixels, found = find_maxima(scores, 37, 50, 4, np.float32(0.3))
@@ -202,7 +202,7 @@ def test_the_same_on_any_number_of_threads(network: Path):
     np.testing.assert_array_equal(one.descriptors, two.descriptors)
 
 
-# what it saw in each cell
+# means per cell
 
 
 def test_cells_are_means_over_the_picture_and_nothing_beyond_it(network: Path):
@@ -215,7 +215,7 @@ def test_cells_are_means_over_the_picture_and_nothing_beyond_it(network: Path):
     assert features.cells is not None
     expected = picture.reshape(4, 24, 6, 24).mean(axis=(1, 3)) / 255.0
     np.testing.assert_allclose(features.cells[:, :, 0], expected, atol=1e-5)
-    assert features.select(np.arange(2)).cells is None  # of the whole picture alone
+    assert features.select(np.arange(2)).cells is None  # only for the whole image
     small = extract_learned(picture[:8, :8], *CONFIG).cells
     assert small is not None
     np.testing.assert_allclose(small, np.full((4, 6, 1), picture[:8, :8].mean() / 255.0), atol=1e-5)
@@ -225,7 +225,7 @@ def test_networks_without_have_none(network: Path):
     assert extract_learned(np.zeros((64, 64), np.uint8), *CONFIG).cells is None
 
 
-# what is not here, or is another
+# missing and unsuitable networks
 
 
 def _refused(network: str = "xfeat", descriptor_size: int = 64) -> str:
@@ -235,7 +235,7 @@ def _refused(network: str = "xfeat", descriptor_size: int = 64) -> str:
     return str(caught.value)
 
 
-def test_a_network_that_is_damaged_missing_or_another_is_told_in_one_line(network: Path):
+def test_a_damaged_missing_or_other_network_is_one_line(network: Path):
     assert "descriptors of 64 numbers, not 32" in _refused(descriptor_size=32)
     write_network(network.with_name("edgepoint2-t32.onnx"), "edgepoint2-s64")
     assert "holds edgepoint2-s64, not edgepoint2-t32" in _refused("edgepoint2-t32")

@@ -184,7 +184,7 @@ def test_the_nearest_and_its_rivals_are_those_of_the_whole_table(num_train: int,
     assert len(expected) > 0
 
 
-def test_broken_map_descriptors_are_nobodys_match_and_break_no_other():
+def test_broken_map_descriptors_match_nothing_and_break_no_other():
     query, train = random_descriptors(0, 40), random_descriptors(1, 120)
     train[17], train[50:90] = np.nan, blurred(query, 2)
     matches = match_features(query, train, MatchingConfig(ratio=0.0, mutual=False))

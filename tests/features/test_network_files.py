@@ -27,7 +27,7 @@ def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.Mon
         NetworkInfo.of_name("xfeat").find_file()
 
 
-def test_a_file_says_which_network_it_is(tmp_path: Path):
+def test_a_file_contains_the_name_of_its_network(tmp_path: Path):
     assert NetworkInfo.of_file(write_network(tmp_path / "any.onnx", "xfeat")) == NETWORKS["xfeat"]
 
 

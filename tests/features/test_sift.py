@@ -17,7 +17,7 @@ def test_descriptors_have_unit_length_and_the_strongest_come_first():
     assert features.descriptors.shape[1] == 128
 
 
-def test_no_more_features_than_asked_for():
+def test_no_more_features_than_requested():
     assert len(extract_sift(picture(), 50)) == 50
 
 

@@ -144,7 +144,7 @@ def test_the_yardstick_is_opencv(shared: Path) -> None:
     assert np.max(np.linalg.norm(described - descriptors[:200], axis=1)) < 0.02
 
 
-def test_unit_length_strongest_first_and_no_more_than_asked() -> None:
+def test_unit_length_strongest_first_and_no_more_than_requested() -> None:
     features = extract_surf(texture(240, 320), 100.0)
     assert len(features) > 100
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)

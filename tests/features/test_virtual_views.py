@@ -25,7 +25,7 @@ CAMERAS = {
     "fisheye": Camera(
         "OPENCV_FISHEYE", 640, 480, (350.0, 351.0, 322.0, 238.0, 0.01, -0.02, 0.005, -0.001)
     ),
-    # The ends of its rows see what lies behind the camera.
+    # The ends of its rows see behind the camera.
     "wider than half of all": Camera(
         "OPENCV_FISHEYE", 800, 600, (220.0, 220.0, 399.5, 299.5, 0.0, 0.0, 0.0, 0.0)
     ),
@@ -66,7 +66,7 @@ def seen(name: str, camera: Camera, texture: np.ndarray) -> tuple[VirtualView, n
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-def test_there_is_one_view_to_each_side_and_it_holds_the_way_ahead(camera: Camera):
+def test_there_is_one_view_to_each_side_and_it_contains_the_path_ahead(camera: Camera):
     assert [view.name for view in make_virtual_views(camera)] == list(SIDES)
     for view in make_virtual_views(camera):
         assert max(view.camera.width, view.camera.height) <= 700
@@ -84,7 +84,7 @@ def test_there_is_one_view_to_each_side_and_it_holds_the_way_ahead(camera: Camer
     side=st.sampled_from([0, 1]),
     at=st.tuples(st.floats(0, 1), st.floats(0, 1)),
 )
-def test_a_pixel_and_where_it_lies_in_the_picture_are_one_direction(
+def test_a_pixel_and_its_source_pixel_have_one_direction(
     camera: Camera, side: int, at: tuple[float, float]
 ):
     view = make_virtual_views(camera)[side]
@@ -122,7 +122,7 @@ def test_features_between_pixels_are_the_points_of_the_same_wall_in_the_picture(
     points_side = view.cam_from_virtual.inverse().apply(points_cam)
     np.testing.assert_allclose(
         points_side[:, 2], distance
-    )  # no slant: the wall is as far away everywhere
+    )  # no slant: the depth of the wall is constant
     features = features_at(view.camera.img_from_cam(points_side))
     np.testing.assert_allclose(
         view.to_image_pixels(features, camera).points_img,
@@ -155,8 +155,7 @@ def in_grey(cells: np.ndarray, cell_m: float) -> np.ndarray:
 @pytest.mark.parametrize("name", SIDES)
 def test_lettering_on_a_wall_stays_readable(name: str, camera: Camera):
     sheet = np.zeros((9, 28), np.float32)
-    # 2 m ahead: to the right of who looks at the left wall, to the left of who looks at the right
-    # one
+    # 2 m ahead: on the right in a view of the left wall, on the left in a view of the right wall
     first = 19 if name == "left" else 5
     sheet[2:7, first : first + 4] = LETTER
     view, picture = seen(name, camera, in_grey(sheet, 0.1))
@@ -179,7 +178,7 @@ def test_lettering_on_a_wall_stays_readable(name: str, camera: Camera):
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize("name", SIDES)
-def test_a_wall_along_the_way_has_the_same_scale_everywhere(name: str, camera: Camera):
+def test_a_wall_along_the_path_has_the_same_scale_everywhere(name: str, camera: Camera):
     """Bars of 0.2 m have equal widths from near to far. A pixel of the slanted wall
     covers up to 4 cm."""
     view, picture = seen(
@@ -196,7 +195,7 @@ def test_a_wall_along_the_way_has_the_same_scale_everywhere(name: str, camera: C
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-def test_what_the_picture_does_not_hold_is_dropped(camera: Camera):
+def test_pixels_outside_of_the_image_are_dropped(camera: Camera):
     for view in make_virtual_views(camera):
         rows, columns = np.mgrid[0 : view.camera.height : 3, 0 : view.camera.width : 3]
         everywhere = features_at(np.column_stack([columns.ravel(), rows.ravel()]))
@@ -221,14 +220,14 @@ def test_what_the_picture_does_not_hold_is_dropped(camera: Camera):
 
 
 @pytest.mark.parametrize(("share", "num_views"), [(0.3, 2), (0.95, 2), (1.05, 0), (4.0, 0)])
-def test_a_lens_that_sees_no_wall_near_enough_has_no_side_views(share: float, num_views: int):
+def test_the_number_of_views_depends_on_the_field_of_view(share: float, num_views: int):
     focal = share * 239.5 * 1.5
     assert (
         len(make_virtual_views(Camera.pinhole(480, 320, focal, focal, 239.5, 159.5))) == num_views
     )
 
 
-def test_a_lens_off_the_middle_may_see_one_side_alone():
+def test_a_camera_with_a_shifted_centre_may_have_one_virtual_view():
     views = make_virtual_views(Camera.pinhole(480, 320, 400.0, 400.0, 120.0, 159.5))
     assert [view.name for view in views] == ["right"]
 

@@ -12,7 +12,7 @@ vectors = arrays(np.float64, 3, elements=coordinates)
 directions = arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(
     lambda v: np.linalg.norm(v) > 0.1
 )
-# Any angle, with those near zero and near pi, where logarithms go wrong, drawn often.
+# Any angle. Angles near zero and pi are frequent, because logarithms are inexact there.
 angles = st.one_of(
     st.floats(0.0, np.pi - 1e-9),
     st.floats(0.0, 1e-6),

@@ -93,7 +93,7 @@ def test_any_exact_scene_is_solved(seed, n):
 
 
 @pytest.mark.parametrize(("method", "outliers"), [("poselib", 0.8), ("opencv", 0.5)])
-def test_outliers_are_told_from_inliers(method, outliers):
+def test_outliers_are_distinguished_from_inliers(method, outliers):
     scene = make_scene(
         np.random.default_rng(1), CAMERAS["OPENCV"], n=400, outliers=outliers, sigma_px=0.5
     )
@@ -236,7 +236,7 @@ def mean_normalized_error(
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
 @pytest.mark.parametrize("depth_noise", [0.0, 0.002])
-def test_covariance_tells_the_error(model, depth_noise):
+def test_covariance_matches_the_error(model, depth_noise):
     assert (
         4.5
         < mean_normalized_error(CAMERAS[model], 100, sigma_px=1.0, depth_noise=depth_noise)
@@ -244,12 +244,12 @@ def test_covariance_tells_the_error(model, depth_noise):
     )
 
 
-def test_covariance_grows_where_the_noise_is_more_than_assumed():
+def test_covariance_grows_with_more_noise_than_assumed():
     config = AbsolutePoseConfig(max_reprojection_error_px=8.0)
     assert 4.5 < mean_normalized_error(PINHOLE, 100, config, sigma_px=2.0) < 8.0
 
 
-def test_covariance_tells_the_error_among_outliers():
+def test_covariance_matches_the_error_among_outliers():
     assert (
         4.5
         < mean_normalized_error(PINHOLE, 100, sigma_px=1.0, depth_noise=0.002, outliers=0.3)

@@ -55,7 +55,7 @@ def test_exact_matches_give_pose_and_focal_length_among_outliers(focal: float):
 
 
 @pytest.mark.parametrize(("num", "num_right"), [(40, 12), (60, 12), (100, 30)])
-def test_the_right_focal_length_is_found_where_few_matches_are_right(num: int, num_right: int):
+def test_the_right_focal_length_is_found_with_few_right_matches(num: int, num_right: int):
     num_found = 0
     for seed in range(20):
         rng, focal = np.random.default_rng(seed), (340.0, 680.0, 1020.0)[seed % 3]
@@ -72,7 +72,7 @@ def test_the_right_focal_length_is_found_where_few_matches_are_right(num: int, n
     assert num_found >= 18
 
 
-def test_of_random_matches_only_so_many_agree_as_by_chance():
+def test_random_matches_agree_only_by_chance():
     rng = np.random.default_rng(0)
     for num in (15, 40, 100):
         pixels, points, covariances = _scene(600.0, rng, num=num)
@@ -107,7 +107,7 @@ def test_the_same_matches_give_the_same_bytes_and_useless_ones_change_nothing():
         assert np.array_equal(first[0].inliers, other[0].inliers[:60])
 
 
-def test_the_inliers_gather_where_some_are_near_and_most_are_far():
+def test_near_and_far_inliers_are_found():
     """Near points also agree with a wrong focal length. A few rounds keep only them, without
     the far points."""
     street = UncalibratedCamera.unknown(1241, 376)
@@ -128,7 +128,7 @@ def test_the_inliers_gather_where_some_are_near_and_most_are_far():
         assert np.count_nonzero(found[0].inliers) >= 155
 
 
-def test_the_covariance_counts_what_is_not_known_of_the_focal_length():
+def test_the_covariance_includes_the_uncertainty_of_the_focal_length():
     distances, plain = [], []
     for seed in range(40):
         pixels, points, covariances = _scene(
@@ -143,7 +143,7 @@ def test_the_covariance_counts_what_is_not_known_of_the_focal_length():
         plain.append(float(np.sqrt(found[0].covariance[2, 2])))
     assert (
         0.5 < np.median(distances) < 9.0
-    )  # chi-square of six degrees: median 5.3; the principal point is in the middle here
+    )  # chi-square of six degrees has median 5.3, and the principal point is central here
     assert np.median(plain) > 0.03, "distance and focal length trade places in a flat scene"
 
 

@@ -97,7 +97,7 @@ def test_a_similarity_is_found_again(a_from_b, scale):
     np.testing.assert_allclose(found.translation, a_from_b.translation, atol=1e-6 * max(1.0, scale))
 
 
-def test_a_straight_way_is_scaled_and_turned_by_its_orientations():
+def test_a_straight_path_is_scaled_and_rotated_by_its_orientations():
     rng = np.random.default_rng(5)
     a_from_b = random_rigid(rng)
     straight = [Rigid3(random_rigid(rng).rotation, np.array([0.1 * k, 0.0, 0.0])) for k in range(6)]

@@ -61,7 +61,7 @@ def test_the_camera_is_found_again(scale: float, dx_px: float, dy_px: float):
     assert camera.params[4:] == TRUE.params[4:]
 
 
-def test_a_wall_seen_straight_says_little_of_the_focal_length():
+def test_a_frontal_wall_leaves_the_focal_length_uncertain():
     rng = np.random.default_rng(1)
     wall = np.column_stack([rng.uniform(-2.0, 2.0, (200, 2)), np.full(200, 5.0)])
     pinhole, covariances = (
@@ -73,7 +73,7 @@ def test_a_wall_seen_straight_says_little_of_the_focal_length():
     assert found is None or np.sqrt(found.covariance[0, 0]) > 0.02
 
 
-def test_too_few_points_say_nothing():
+def test_too_few_points_give_no_result():
     pixels, points, covariances = room(np.random.default_rng(2), 10)
     assert (
         estimate_image_calibration(pixels, points, covariances, TRUE, CAM_FROM_WORLD, 0.5) is None

@@ -17,7 +17,7 @@ from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 
 CAMERA = Camera.pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
-SIGMAS = np.array([0.02, 0.015, 0.015])  # a picture alone: 5 % of the focal length are 2.5 sigmas
+SIGMAS = np.array([0.02, 0.015, 0.015])  # one image: 5 % of the focal length are 2.5 sigmas
 
 
 def pictures(
@@ -51,7 +51,7 @@ def pictures(
         ((0.0, 0.0, -0.08), False, True),
     ],
 )
-def test_together_they_name_what_one_cannot(
+def test_images_together_name_errors_that_one_cannot(
     deviation: tuple[float, float, float],
     has_focal_mismatch: bool,
     has_principal_point_mismatch: bool,
@@ -74,7 +74,7 @@ def test_together_they_name_what_one_cannot(
         assert "the pictures say" in str(verdict)
 
 
-def test_right_calibrations_are_not_accused_and_sigmas_are_honest():
+def test_right_calibrations_pass_and_sigmas_are_right():
     rng = np.random.default_rng(1)
     normed = []
     for _ in range(200):
@@ -124,7 +124,7 @@ def test_a_scatter_beyond_their_noise_is_seen():
     assert not verdict.is_contradicted
 
 
-def test_few_pictures_say_nothing():
+def test_few_images_give_no_result():
     rng = np.random.default_rng(5)
     assert (
         check_calibration_consistency(pictures((0.2, 0.0, 0.0), MIN_IMAGES - 1, rng), CAMERA)
@@ -140,7 +140,7 @@ def test_few_pictures_say_nothing():
     )
 
 
-def test_pictures_that_all_say_the_same():
+def test_images_with_equal_deviations():
     verdict = check_calibration_consistency(
         [
             IntrinsicsDeviation(np.zeros(3), np.diag(SIGMAS**2), place)

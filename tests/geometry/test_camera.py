@@ -83,7 +83,7 @@ def test_rescaled_camera_sees_the_same_rays(model, width, height):
     )
 
 
-def test_rescaling_keeps_the_model_where_both_scales_agree():
+def test_rescaling_keeps_the_model_if_both_scales_agree():
     assert CAMERAS["SIMPLE_RADIAL"].rescaled(320, 240).model == "SIMPLE_RADIAL"
     assert CAMERAS["SIMPLE_RADIAL"].rescaled(320, 241).model == "OPENCV"
     assert CAMERAS["OPENCV"].rescaled(752, 480) == CAMERAS["OPENCV"]
@@ -98,7 +98,7 @@ def test_points_behind_the_camera_have_no_pixel(model):
 
 def test_points_beyond_the_fold_of_the_distortion_have_no_pixel():
     camera = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
-    fold = np.sqrt(1 / 0.9)  # where 1 - 3 * 0.3 r^2 = 0
+    fold = np.sqrt(1 / 0.9)  # at 1 - 3 * 0.3 r^2 = 0
     points_cam = np.array(
         [[0.98 * fold, 0.0, 1.0], [1.02 * fold, 0.0, 1.0], [2.0 * fold, 0.0, 1.0]]
     )
@@ -163,7 +163,7 @@ def test_colmap_and_json_round_trips(model):
         ({"width": 0, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}, "positive"),
     ],
 )
-def test_unusable_calibration_says_what_is_wrong(data, message):
+def test_the_error_of_an_unusable_calibration_names_its_fault(data, message):
     with pytest.raises(CalibrationError, match=message):
         Camera.from_json(data)
 

@@ -50,7 +50,7 @@ def test_independent_errors_do_not_cohere():
     assert np.median(found) < 1.3
 
 
-def test_what_was_moved_shows_and_widens_as_much_as_it_is_off():
+def test_moved_objects_are_detected_and_widen_the_covariance():
     still, moved = ([coherence_of(seed, by) for seed in range(20)] for by in (0.0, 0.02))
     assert np.median([found for found, _ in moved]) > 1.7 * np.median([found for found, _ in still])
     off = np.array(moved)
@@ -61,7 +61,7 @@ def test_what_was_moved_shows_and_widens_as_much_as_it_is_off():
 
 
 @pytest.mark.parametrize("count", [0, 1, 4, 5])
-def test_of_few_matches_nothing_is_said(count: int):
+def test_few_matches_give_no_result(count: int):
     points_img, points = seen(0, 0.05, max(count, 1))
     arguments = points_img[:count], points[:count], NO_COVARIANCES[:count]
     assert compute_variance_inflation(*arguments, CAMERA, Rigid3.identity(), 1.0) == 1.0

@@ -28,7 +28,7 @@ def test_earth_centred_coordinates_are_those_of_proj(lat: float, lon: float, h: 
 
 
 @given(lat=LATITUDES, lon=LONGITUDES, h=HEIGHTS)
-def test_the_way_back_ends_where_it_began(lat: float, lon: float, h: float):
+def test_the_inverse_conversion_gives_the_input(lat: float, lon: float, h: float):
     point = GeoPoint(lat, lon, h)
     again = GeoPoint.from_ecef(point.ecef())
     np.testing.assert_allclose(again.ecef(), point.ecef(), atol=1e-6)
@@ -151,7 +151,7 @@ def test_no_place_on_earth(lat: float, lon: float, h: float):
 
 
 @pytest.mark.parametrize("data", [None, {}, [], {"origin": 3}, {"position": {}, "quaternion": {}}])
-def test_what_is_no_georeference(data: object):
+def test_invalid_georeferences_are_refused(data: object):
     with pytest.raises(GeoreferenceError):
         Georeference.from_json(data)
     with pytest.raises(GeoreferenceError):

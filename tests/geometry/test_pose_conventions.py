@@ -96,7 +96,7 @@ def test_units_bodies_and_combinations():
     )
 
 
-def test_what_the_option_says():
+def test_the_option_is_parsed():
     assert PoseConventions.parse("wxyz, shift=-0.25,clock=1e6") == PoseConventions(
         ("wxyz",), 1e6, -0.25
     )
@@ -119,6 +119,6 @@ def test_what_the_option_says():
         "body=0,0,0,0,0,0,0",
     ],
 )
-def test_what_makes_no_sense_is_an_error(text: str):
+def test_invalid_options_are_refused(text: str):
     with pytest.raises(TrajectoryError):
         PoseConventions.parse(text)

@@ -47,6 +47,6 @@ def test_a_camera_that_only_turns_has_no_direction():
 
 
 @pytest.mark.parametrize("num_points", [0, 5, 7])
-def test_too_few_points_tell_nothing(num_points: int):
+def test_too_few_points_give_no_result(num_points: int):
     first, second = seen(Rigid3(np.eye(3), np.array([0.5, 0.0, 0.0])))
     assert estimate_relative_pose(first[:num_points], FIRST, second[:num_points], SECOND) is None

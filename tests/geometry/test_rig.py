@@ -91,7 +91,7 @@ def test_a_point_has_one_row_in_both_rectified_images(name, x, y, depth):
     pixel = np.array([[x * (rectified.left.width - 2), y * (rectified.left.height - 2)]])
     point_rectified = rectified.left.rays_from_img(pixel) * depth
     point_left = rectification.rectified_from_left.inverse().apply(point_rectified)
-    # What the rectified image shows at this pixel is where the raw camera saw the point.
+    # The rectified image samples this pixel at the point's pixel in the raw image.
     left_raw = rig.left.img_from_cam(point_left)[0]
     np.testing.assert_allclose(sample(rectification.left_map, *pixel[0]), left_raw, atol=1e-2)
 

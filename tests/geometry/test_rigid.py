@@ -121,7 +121,7 @@ def test_poses_within_both_tolerances_are_the_same():
     assert not pose.is_same(pose)
 
 
-def test_poses_are_the_same_if_the_covariance_allows_what_the_tolerance_does_not():
+def test_poses_are_the_same_if_the_covariance_allows_it_beyond_the_tolerance():
     here, there = Rigid3.identity(), Rigid3(np.eye(3), np.array([1.5, 0.0, 0.0]))
     along, across = np.diag([0.5, *[1e-8] * 5]), np.diag([1e-8, 0.5, *[1e-8] * 4])
     assert here.is_same(there, 0.5, 0.1, along, 12.6)
@@ -156,7 +156,7 @@ def test_from_matrix_makes_rounded_rotations_exact():
         (np.zeros((3, 4)), "no rotation"),
     ],
 )
-def test_what_is_no_pose_is_refused(matrix, message):
+def test_an_invalid_pose_is_refused(matrix, message):
     with pytest.raises(TrajectoryError, match=message):
         Rigid3.from_matrix(matrix)
 
@@ -164,11 +164,11 @@ def test_what_is_no_pose_is_refused(matrix, message):
 @pytest.mark.parametrize(
     "quat_wxyz", [np.zeros(4), np.array([1.0, np.nan, 0.0, 0.0]), np.full(4, np.inf)]
 )
-def test_what_is_no_quaternion_is_refused(quat_wxyz):
+def test_an_invalid_quaternion_is_refused(quat_wxyz):
     with pytest.raises(TrajectoryError, match="not a rotation"):
         Rigid3.from_quat_wxyz(quat_wxyz, np.zeros(3))
 
 
-def test_what_is_no_translation_is_refused():
+def test_an_invalid_translation_is_refused():
     with pytest.raises(TrajectoryError, match="not a translation"):
         Rigid3.from_quat_wxyz(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, np.nan, 0.0]))

@@ -44,7 +44,7 @@ def test_a_camera_at_rest_is_left_alone():
     assert _found([0.0, 0.0, 0.0]) is None
 
 
-def test_pixels_are_moved_to_where_they_would_be_at_rest():
+def test_pixels_are_moved_to_their_positions_at_rest():
     found = TurningCamera(CAM_FROM_WORLD, np.deg2rad([0.0, 2.0, 0.0]), np.eye(6), 480)
     first, middle = found.undo(np.array([[319.5, 0.0], [319.5, 239.5]]), CAMERA)
     np.testing.assert_allclose(middle, [319.5, 239.5])

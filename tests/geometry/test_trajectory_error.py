@@ -40,7 +40,7 @@ def test_steps_two_percent_too_long_are_two_percent_of_drift():
     straight = [Rigid3(np.eye(3), np.array([0.0, 0.0, float(i)])) for i in range(60)]
     longer = [Rigid3(np.eye(3), 1.02 * pose.translation) for pose in straight]
     assert relative_drift(straight, longer) is not None
-    # a straight way fixes no rotation by positions alone: the errors are those along it, centred
+    # positions on a line fix no rotation about it: the errors are along it, centred
     np.testing.assert_allclose(
         absolute_trajectory_errors(straight, longer), 0.02 * np.abs(np.arange(60) - 29.5), atol=1e-6
     )
@@ -53,7 +53,7 @@ def test_rotation_drift_is_a_metre():
     assert drift.rotation == pytest.approx(yaw_error / (2 * np.pi * radius / num), rel=0.05)
 
 
-def test_too_short_a_way_has_no_drift_and_unequal_lengths_are_refused():
+def test_too_short_a_path_has_no_drift_and_unequal_lengths_are_refused():
     assert relative_drift(circle(3, 0.5), circle(3, 0.5)) is None
     with pytest.raises(TrajectoryError, match="3 and 4"):
         relative_drift(circle(3), circle(4))

@@ -68,7 +68,7 @@ def test_the_truth_is_found_among_twice_as_many_outliers(seed, num_right, num_wr
     assert in_sigma(found.a_from_b, a_from_b, found.covariance) < 6.0
 
 
-def test_the_covariance_says_how_wrong_the_consensus_is():
+def test_the_covariance_matches_the_error_of_the_consensus():
     rng = np.random.default_rng(3)
     squares = []
     for _ in range(100):
@@ -92,7 +92,7 @@ def test_estimates_of_different_transforms_are_no_consensus(seed):
 @pytest.mark.parametrize(
     ("num_rivals", "is_believed"), [(0, True), (2, True), (3, False), (6, False)]
 )
-def test_as_likely_as_another_one_is_not_believed(num_rivals, is_believed):
+def test_an_equally_likely_alternative_prevents_a_consensus(num_rivals, is_believed):
     """Six estimates agree here. The others agree on a panel one metre beside it."""
     rng = np.random.default_rng(0)
     a_from_b, covariances = random_rigid(rng), random_covariances(rng, 6 + num_rivals)
@@ -109,7 +109,7 @@ def test_many_estimates_from_one_picture_are_one():
     estimates = estimates_of(a_from_b, covariances, rng)
     one_picture = np.column_stack([np.zeros(8, np.int64), np.arange(8)])
     assert find_consensus(estimates, covariances, one_picture) is None
-    # three pictures of a with three of b, crosswise: nine estimates say what three do
+    # three images of a with three of b, crosswise: nine estimates count as three
     crosswise = np.array([[i, j] for i in range(3) for j in range(3)])
     covariances = random_covariances(rng, 9)
     found = find_consensus(estimates_of(a_from_b, covariances, rng), covariances, crosswise)
@@ -149,7 +149,7 @@ def test_of_very_many_a_sample_of_hypotheses_is_enough():
     assert np.count_nonzero(found.is_inlier) == 100
 
 
-def test_fewer_than_asked_for_say_nothing():
+def test_fewer_estimates_than_required_give_no_consensus():
     assert find_consensus([], np.zeros((0, 6, 6))) is None
     assert find_consensus([Rigid3.identity()] * 2, np.tile(np.eye(6), (2, 1, 1))) is None
 

@@ -21,7 +21,7 @@ from topoloc.recordings.frame import IndexedFrames, StereoFrame
 
 FIRST, DARK = [-3.0 + 0.1 * k for k in range(20)], 20
 FAR = [7.5 - 0.135 * k for k in range(78)]
-"""After the dark the camera is at the other end, and goes backwards to where it began."""
+"""After the dark, the camera is at the other end and moves backwards to its start."""
 
 
 @dataclass(eq=False, repr=False)

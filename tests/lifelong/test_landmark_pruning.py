@@ -53,7 +53,7 @@ def test_the_file_is_smaller_and_the_same_is_found(path: Path):
     )
 
 
-def test_what_is_rounded_stays_as_it_is(path: Path):
+def test_pruning_again_changes_nothing(path: Path):
     main(["prune", str(path), "--descriptors", "coarse"])
     data = path.read_bytes()
     main(["prune", str(path), "--descriptors", "coarse"])

@@ -133,7 +133,7 @@ def test_a_walk_elsewhere_is_refused(map_file: Path, complaint: Callable[..., st
     assert map_file.read_bytes() == before
 
 
-def test_images_that_show_nothing_where_their_poses_predict_it_teach_nothing(
+def test_images_that_contradict_their_poses_teach_nothing(
     map_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """The map recognises the other images, and their poses are right."""
@@ -148,7 +148,7 @@ def test_images_that_show_nothing_where_their_poses_predict_it_teach_nothing(
     assert "poorly recognised images taught it nothing: they show" in said
 
 
-def test_an_image_is_looked_for_between_its_neighbours(by_day: Path):
+def test_an_image_is_searched_between_its_neighbours(by_day: Path):
     """A missing frame gets a pose only if the map finds one near the middle of its neighbours."""
     walk = open_sequence(LAB / "day")
     with TopoMetricMap.load(by_day) as topomap:

@@ -53,7 +53,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no locks")
-def test_a_merge_over_a_map_that_is_edited_waits_and_says_so(
+def test_a_merge_over_a_map_in_edit_waits_with_a_message(
     maps: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out = Path(shutil.copy(maps[0], tmp_path / "out.topo"))
@@ -113,7 +113,7 @@ def test_maps_of_two_places_stay_apart(
     assert not (tmp_path / "both.topo").exists()
 
 
-def test_what_cannot_be_merged_is_named(
+def test_maps_that_cannot_be_merged_are_named(
     maps: tuple[Path, Path], tmp_path: Path, complaint: Callable[..., str]
 ):
     first, second = maps

@@ -33,7 +33,7 @@ def _holds(landmarks: list[list[int]], pictures: list[int]) -> NodeSupport:
     return NodeSupport(by, np.take_along_axis(np.array(landmarks), by, axis=1), np.array(pictures))
 
 
-def test_the_node_that_another_one_shows_goes_first():
+def test_the_most_redundant_node_is_removed_first():
     holds = _holds([[500, 400, 80], [400, 500, 90], [80, 90, 500]], [1, 3, 1])
     order = list(iterate_node_removals(holds, 60))
     assert order[0][0] == 0, "its twin stands for three pictures"
@@ -41,12 +41,12 @@ def test_the_node_that_another_one_shows_goes_first():
     assert len(order) == 2, "one is left"
 
 
-def test_what_nothing_else_holds_stays():
+def test_nodes_without_support_stay():
     holds = _holds([[500, 50, 10], [50, 500, 10], [10, 10, 500]], [1, 1, 1])
     assert list(iterate_node_removals(holds, 60)) == []
 
 
-def test_what_went_is_not_forgotten():
+def test_removed_nodes_still_need_support():
     """Nodes 0 and 2 support node 1. After its removal only 0 supports its place and stays, though 2
     shows enough of 0."""
     holds = _holds([[500, 300, 100], [300, 400, 30], [50, 30, 500]], [1, 1, 5])
@@ -54,7 +54,7 @@ def test_what_went_is_not_forgotten():
     assert order == [1]
 
 
-def test_pictures_edges_and_place_vectors_go_to_the_node_that_holds(room_map: Path, tmp_path: Path):
+def test_images_edges_and_descriptors_move_to_the_supporting_node(room_map: Path, tmp_path: Path):
     path = tmp_path / "fewer.topo"
     with TopoMetricMap.load(room_map) as topomap:
         holds, num = compute_node_support(topomap, 4), len(topomap.summaries)

@@ -65,14 +65,14 @@ def _rms(
     [(0.0003, SIGMA_M, 0.92), (0.015, 0.004, 0.5)],
     ids=["a lap without drift, asked by night", "a walk that drifts, in a map that knows it well"],
 )
-def test_a_session_is_placed_better_by_what_it_tells_of_itself(
+def test_estimated_noise_scales_improve_the_poses_of_a_session(
     of_motion: float, of_answers: float, share: float
 ):
     own, answers = _motion(of_motion), _answers(of_answers)
     assert _rms(own, answers, None) < share * _rms(own, answers, NoiseScale())
 
 
-def test_nothing_is_lost_where_it_is_as_assumed():
+def test_nothing_is_lost_if_the_noise_is_as_assumed():
     own, answers = _motion(0.003), _answers(SIGMA_M)
     assert _rms(own, answers, None) < 1.1 * _rms(own, answers, NoiseScale())
 
@@ -89,7 +89,7 @@ def _steps(own: dict[int, Rigid3], answers: dict[int, Localization | None]) -> l
     return steps
 
 
-def test_one_wrong_answer_changes_nothing():
+def test_one_wrong_pose_changes_nothing():
     steps = _steps(_motion(0.0003), _answers(SIGMA_M))
     trust = fit_noise_scale(steps, *FACTORS)
     assert trust == NoiseScale(0.5, 1.0)
@@ -100,6 +100,6 @@ def test_one_wrong_answer_changes_nothing():
     assert fit_noise_scale(steps, *FACTORS) == trust
 
 
-def test_a_single_answer_tells_nothing():
+def test_a_single_pose_gives_no_scale():
     steps = _steps(_motion(0.01), _answers(SIGMA_M))
     assert fit_noise_scale(steps[:1], *FACTORS) == NoiseScale()

@@ -77,7 +77,7 @@ def _errors_m(path: Path) -> list[float]:
     ]
 
 
-def test_landmarks_that_are_gone_go_and_no_others(room_map: Path, tmp_path: Path):
+def test_only_missing_landmarks_are_removed(room_map: Path, tmp_path: Path):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     _with_later_session(path, lambda num: np.where(np.arange(num) % 4 == 0, 0, 5))
     before, data = _num_points(path), path.read_bytes()
@@ -98,7 +98,7 @@ def test_landmarks_that_are_gone_go_and_no_others(room_map: Path, tmp_path: Path
     assert path.read_bytes() == data
 
 
-def test_what_another_light_hides_is_not_gone(room_map: Path, tmp_path: Path):
+def test_landmarks_hidden_by_other_light_stay(room_map: Path, tmp_path: Path):
     """A session that matches a tenth of a node's landmarks is no evidence about the others."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     _with_later_session(path, lambda num: np.where(np.arange(num) % 10 == 0, 6, 0))
@@ -107,7 +107,7 @@ def test_what_another_light_hides_is_not_gone(room_map: Path, tmp_path: Path):
     assert path.read_bytes() == before
 
 
-def test_what_chance_may_have_hidden_is_not_gone(room_map: Path, tmp_path: Path):
+def test_landmarks_missed_by_chance_stay(room_map: Path, tmp_path: Path):
     """A session that finds a third of the visible landmarks misses one in six images with
     probability 1/11."""
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
@@ -139,7 +139,7 @@ def test_a_size_is_kept_and_the_map_still_localizes(room_map: Path, tmp_path: Pa
     assert max(_errors_m(path)) < 0.02
 
 
-def test_what_is_kept_is_spread_over_the_picture(room_map: Path, tmp_path: Path):
+def test_remaining_landmarks_are_spread_over_the_image(room_map: Path, tmp_path: Path):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     with TopoMetricMap.load(path) as topomap:
         before = topomap.nodes[3].features.points_img
@@ -175,7 +175,7 @@ def test_the_size_of_a_map_is_measured_behind_the_checks_of_its_file(
         assert "forged.topo is damaged" in complaint(*words)
 
 
-def test_points_of_a_node_go_with_what_sessions_know_of_them(room_map: Path):
+def test_removed_points_lose_their_session_statistics(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
         node = topomap.nodes[0]
         kept = np.arange(1, len(node.features), 3)

@@ -38,7 +38,9 @@ def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room
     assert _format_changes({"landmarks_gone": 3}) == ": landmarks gone 3"
 
 
-def test_the_history_tells_it(room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_history_contains_it(
+    room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     with TopoMetricMap.load(path) as topomap:
         num = len(topomap.nodes)

@@ -55,7 +55,7 @@ def test_wrong_answers_are_left_out():
     assert agreeing == [k for k in answers if k not in (8, 40, 64)]
 
 
-def test_a_drifting_unit_is_held_between_answers_and_wrong_ones_bend_nothing():
+def test_a_drifting_unit_is_fixed_by_poses_and_wrong_ones_bend_nothing():
     answers = _answers([*range(0, 20, 2), 40, *range(60, 80, 2)], [40])
     poses, agreeing = align_stretch_to_map("walk", _motion(0.1), answers, 0.6)
     assert poses is not None
@@ -67,12 +67,12 @@ def test_a_drifting_unit_is_held_between_answers_and_wrong_ones_bend_nothing():
     assert max(off) < 0.1
 
 
-def test_too_few_answers_hold_nothing():
+def test_too_few_poses_fix_no_scale():
     poses, _ = align_stretch_to_map("walk", _motion(0.0), _answers([0, 30, 60], []), 0.6)
     assert poses is None
 
 
-def test_where_the_unit_is_not_known_there_are_no_poses():
+def test_frames_far_from_any_pose_are_dropped():
     answers = _answers(list(range(0, 20, 2)), [])
     metric = scale_to_metres(_motion(0.0), answers, drift=0.1, max_sigma=0.2)
     assert 0 in metric
@@ -80,7 +80,7 @@ def test_where_the_unit_is_not_known_there_are_no_poses():
     assert 79 not in metric
 
 
-def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
+def test_frames_with_a_contradiction_of_map_and_motion_get_no_poses():
     """The start of the motion is wrong. The map localizes four of its images and not the
     one between them."""
     motion = _motion(0.0)
@@ -96,7 +96,7 @@ def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
     assert poses.keys() >= set(range(6, len(TRUTH)))
 
 
-def test_two_ways_that_the_map_answers_are_none():
+def test_two_consistent_sets_of_poses_give_no_result():
     """The map localizes most images at a similar place in reverse direction."""
     turned = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.array([9.0, -3.0, 0.0]))
     answers = _answers([*range(0, 30, 2), *range(40, 60, 2)], [])

@@ -137,7 +137,7 @@ def test_parts_of_one_walk_become_one_world(joined_atlas: tuple[Path, Manifest])
         assert np.allclose(found.matrix(), tile.joint.joint_from_world.matrix())
 
 
-def test_each_join_is_as_certain_as_it_says(joined_atlas: tuple[Path, Manifest]):
+def test_each_join_is_as_exact_as_it_states(joined_atlas: tuple[Path, Manifest]):
     manifest = joined_atlas[1]
     assert [join.pair for join in manifest.joins] == [
         ("left", "middle"),
@@ -171,10 +171,10 @@ def test_a_room_of_the_same_plan_is_not_joined(joined_once: tuple[Path, TileJoin
     pairs = [
         (a.tile_id, b.tile_id) for a, b in find_candidate_pairs(Atlas.open(str(where)), {"left"})
     ]
-    assert pairs == [("left", "other")]  # what is joined is not compared again
+    assert pairs == [("left", "other")]  # joined tiles are not compared again
 
 
-def test_answers_agree_through_the_joins_and_say_where_in_the_joint_world(
+def test_poses_agree_through_the_joins_and_have_a_pose_in_the_joint_world(
     joined_atlas: tuple[Path, Manifest],
 ):
     """In the overlap, both tiles localize the image. Without a join that is ambiguous."""
@@ -200,7 +200,9 @@ def test_near_a_pose_reaches_tiles_that_are_joined(joined_atlas: tuple[Path, Man
     assert translation_error(WORLDS["right"] @ path_pose(9.0), pose) < 0.01
 
 
-def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp_path: Path):
+def test_one_georeferenced_tile_georeferences_all(
+    own: Path, parts: dict[str, Path], tmp_path: Path
+):
     """A georeferenced map replaces the middle tile. Its old joins are removed, and new
     ones are found."""
     place, enu_from_room = (
@@ -238,9 +240,7 @@ def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp
     assert gone.by_id["left"].geo_box is None
 
 
-def test_what_was_found_of_a_map_that_is_replaced_meanwhile_is_left_out(
-    own: Path, parts: dict[str, Path]
-):
+def test_joins_of_a_map_replaced_meanwhile_are_dropped(own: Path, parts: dict[str, Path]):
     before = Atlas.open(str(own)).manifest
     add_tiles(str(own), new_tiles([str(parts["left"])], "middle"), replaces=True)
     after = add_joins(str(own), before.joins, before.by_id)
@@ -249,7 +249,7 @@ def test_what_was_found_of_a_map_that_is_replaced_meanwhile_is_left_out(
     assert add_joins(str(own), before.joins, before.by_id).joins == ()
 
 
-def test_what_lies_far_apart_on_earth_is_not_even_compared(parts: dict[str, Path], tmp_path: Path):
+def test_tiles_far_apart_on_earth_are_not_compared(parts: dict[str, Path], tmp_path: Path):
     where = tmp_path / "campus"
     for name, lat in (("left", 50.0), ("middle", 50.1)):
         with TopoMetricMap.load(parts[name]) as topomap:
@@ -324,7 +324,7 @@ def test_a_pair_with_a_tile_that_cannot_be_read_is_an_error(
     assert "is not a topoloc map" in capsys.readouterr().err
 
 
-def test_what_cannot_be_meant_is_said(own: Path, complaint: Callable[..., str]):
+def test_invalid_arguments_are_one_line(own: Path, complaint: Callable[..., str]):
     assert "has no tile 'attic'" in complaint("atlas", "join", own, "attic")
     assert "--join belongs to create and add" in complaint("atlas", "info", own, "--join", status=2)
     assert "--config belongs to join" in complaint(
@@ -341,7 +341,7 @@ def test_info_names_worlds_and_joins(
     assert "join   left and middle: " in printed
 
 
-def test_pieces_of_one_recording_are_joined_by_the_pictures_that_both_have(
+def test_pieces_of_one_recording_are_joined_by_shared_images(
     parts: dict[str, Path], tmp_path: Path
 ):
     """Each piece has its own world frame. Maps of other images of the walk share no image."""

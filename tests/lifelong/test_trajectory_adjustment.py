@@ -55,7 +55,7 @@ def _answers() -> dict[int, Localization]:
     return {k: Localization(TRUTH[k], covariance, 0.99, 0, [], 100, 80) for k in KNOWN}
 
 
-def test_the_whole_says_how_long_the_rest_is(stretch: MonocularSubmap):
+def test_the_mapped_part_fixes_the_scale_of_the_rest(stretch: MonocularSubmap):
     held = _too_long(1.15)
     adjusted = adjust_trajectory(stretch, held, _answers())
     assert _off(held) > 0.08

@@ -37,7 +37,7 @@ def _off(poses: dict[int, Rigid3]) -> np.ndarray:
     return np.array([(np.linalg.norm(one.translation), np.degrees(one.angle())) for one in apart])
 
 
-def test_where_the_map_answers_the_walk_is_as_it_says():
+def test_the_trajectory_follows_the_poses_of_the_map():
     walk, answers = _bent(0.05, 1.5), {k: _localized(TRUTH[k], 0.03, 0.6) for k in ANSWERED}
     straight = correct_trajectory(walk, answers, D_THRESH)
     known, before = _off(straight)[:60], _off(walk)[:60]
@@ -45,13 +45,13 @@ def test_where_the_map_answers_the_walk_is_as_it_says():
     assert np.all(known.max(axis=0) < 0.5 * before.max(axis=0))
 
 
-def test_far_beyond_the_answers_it_keeps_its_own_shape():
+def test_far_from_poses_the_trajectory_keeps_its_shape():
     walk, answers = _bent(0.05, 1.5), {k: _localized(TRUTH[k]) for k in ANSWERED}
     straight = correct_trajectory(walk, answers, D_THRESH)
     np.testing.assert_allclose(_off(straight)[90:], _off(walk)[90:], atol=1e-6)
 
 
-def test_single_answers_and_ones_that_are_not_sure_hardly_move_it():
+def test_single_and_uncertain_poses_hardly_move_it():
     walk = dict(enumerate(TRUTH))
     beside = Rigid3(np.eye(3), TRUTH[30].translation + np.array([0.08, 0.0, 0.0]))
     answers = {k: _localized(TRUTH[k]) for k in ANSWERED} | {30: _localized(beside)}
@@ -63,7 +63,7 @@ def test_single_answers_and_ones_that_are_not_sure_hardly_move_it():
     assert _off(correct_trajectory(walk, unsure, D_THRESH))[:, 0].max() < 0.005
 
 
-def test_what_the_map_is_sure_of_and_contradicts_is_no_bend():
+def test_certain_poses_that_contradict_the_walk_do_not_bend_it():
     walk = dict(enumerate(TRUTH))
     elsewhere = {
         k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.2, 0.0, 0.0])))

@@ -96,7 +96,7 @@ def _off(answers: list[Localization | None], indices: np.ndarray) -> list[float]
     ]
 
 
-def test_a_session_goes_on_from_what_is_mapped(
+def test_a_session_extends_the_map(
     map_file: Path, second_half: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     before, far = map_file.read_bytes(), np.arange(18.1, 23.0, 1.2)
@@ -129,7 +129,7 @@ def test_a_session_goes_on_from_what_is_mapped(
     assert map_file.read_bytes() == before
 
 
-def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, second_half: Path):
+def test_separate_stretches_are_each_aligned_to_the_map(map_file: Path, second_half: Path):
     """SLAM leaves such stretches if it was lost between them. One that contradicts the map gets no
     poses, and the others keep theirs."""
     sequence = open_sequence(second_half)
@@ -281,7 +281,7 @@ def test_a_map_that_is_read_only_stays_as_it_is(
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no locks")
-def test_the_second_of_two_updates_at_once_waits_and_says_so(map_file: Path, second_half: Path):
+def test_the_second_of_two_updates_at_once_waits_with_a_message(map_file: Path, second_half: Path):
     words = [sys.executable, "-m", "topoloc", "update", str(map_file), str(second_half)]
     with edit_map(map_file) as edit:
         second = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -319,7 +319,7 @@ def test_another_day_of_the_same_name_and_clock_is_another_session(map_file: Pat
         assert [session.name for session in topomap.sessions] == ["room", "room"]
 
 
-def test_the_history_tells_what_was_done(
+def test_the_history_lists_the_updates(
     map_file: Path, second_half: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert main(["update", str(map_file), str(second_half), "--light", "evening"]) == 0

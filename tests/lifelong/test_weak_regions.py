@@ -42,7 +42,7 @@ def with_outpost(tiny_recording: Path, tmp_path_factory: pytest.TempPathFactory)
     return path
 
 
-def test_a_node_is_not_held_by_itself(with_outpost: Path):
+def test_a_node_does_not_support_itself(with_outpost: Path):
     with TopoMetricMap.load(with_outpost) as topomap:
         localizer, last = Localizer(topomap), topomap.nodes[-1]
         picture = QueryImage.of_features({topomap.kind: last.features}, last.camera)
@@ -64,7 +64,7 @@ def test_a_node_is_not_held_by_itself(with_outpost: Path):
     )
 
 
-def test_those_beside_a_node_are_left_out_too_where_that_is_wished(room_map: Path):
+def test_neighbours_of_a_node_can_be_excluded(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
         alone, beside, all_out = (
             find_weak_regions(Localizer(topomap), max_queries=3, beside=width)
@@ -91,7 +91,7 @@ def _changed(
     )
 
 
-def test_few_landmarks_other_sessions_and_who_looks_back(room_map: Path):
+def test_few_landmarks_other_sessions_and_reverse_views(room_map: Path):
     def change(nodes: list[TopoNode]) -> list[TopoNode]:
         first, second, *rest = nodes
         few = select_landmarks(first, np.arange(40))
@@ -126,7 +126,7 @@ def test_few_landmarks_other_sessions_and_who_looks_back(room_map: Path):
     assert everywhere.count("one_direction") == 0
 
 
-def test_what_is_asked_is_spread_over_the_map():
+def test_the_queries_are_spread_over_the_map():
     assert sample_evenly(range(5), 9) == [0, 1, 2, 3, 4]
     assert sample_evenly(range(101), 3) == [0, 50, 100]
     assert sample_evenly(range(3), 0) == []
@@ -173,7 +173,7 @@ def test_the_command_prints_writes_and_draws(
     assert again.read_text() == html
 
 
-def test_what_is_of_recordings_is_not_taken_beside_it(
+def test_options_of_recordings_are_refused(
     room_map: Path, with_outpost: Path, queries: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))

@@ -82,7 +82,7 @@ def test_an_image_of_the_mapped_colours_keeps_its_probability_and_names_its_appe
         assert Localization.from_json(line).appearance == found.appearance
 
 
-def test_a_painted_room_looks_less_like_the_map_and_is_recognised_if_the_pose_is_clear(
+def test_a_painted_room_is_less_similar_and_is_localized_if_the_pose_is_clear(
     lab: TopoMetricMap,
 ):
     image, half = _unseen()[0].image, _unseen()[0].image.copy()
@@ -96,7 +96,7 @@ def test_a_painted_room_looks_less_like_the_map_and_is_recognised_if_the_pose_is
     assert all(isinstance(found, Localization) for found in _ask(lab, [half, _painted(image)]))
 
 
-def test_a_map_with_look_alike_floors_refuses_other_colours_and_images_without_any(
+def test_a_map_with_similar_floors_refuses_other_colours_and_grey_images(
     lab: TopoMetricMap,
 ):
     image = _unseen()[0].image
@@ -114,7 +114,7 @@ def test_a_map_with_look_alike_floors_refuses_other_colours_and_images_without_a
     assert isinstance(_ask(lab, [to_grey(image)])[0], Localization)
 
 
-def test_a_stream_in_a_map_with_look_alike_floors_is_sure_after_three_places(lab: TopoMetricMap):
+def test_a_stream_in_a_map_with_similar_floors_is_certain_after_three_places(lab: TopoMetricMap):
     frames = _unseen()
     for topomap, num_waiting in ((lab, 0), (_with_look_alikes(lab), 4)):
         tracker, states = Tracker(Localizer(topomap)), list[str]()
@@ -183,7 +183,7 @@ def test_the_setting_is_an_option_of_build_is_shown_and_changed_later(
         assert topomap.config.look_alike_floors
 
 
-def test_a_map_of_grey_images_cannot_tell_floors_apart_and_stays_as_it_is(
+def test_a_map_of_grey_images_cannot_distinguish_floors_and_stays(
     room_map: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))

@@ -38,7 +38,7 @@ def _along(result: Localization | NotLocalized) -> float:
     return float(result.world_from_cam.translation[0])
 
 
-# of the same pose, the one with the most for it
+# the strongest hypothesis of each pose
 
 
 def test_a_hypothesis_of_the_same_pose_replaces_the_weaker_one_and_not_the_stronger():
@@ -52,7 +52,7 @@ def test_a_hypothesis_of_the_same_pose_replaces_the_weaker_one_and_not_the_stron
     assert search.best is strong
 
 
-def test_poses_within_twice_what_is_tolerated_are_one():
+def test_poses_within_twice_the_tolerance_are_one():
     here = made_fit(0.0)
     assert is_same_fit(here, made_fit(0.4), CONFIG)
     assert not is_same_fit(here, made_fit(0.6), CONFIG)
@@ -63,9 +63,7 @@ def test_poses_within_twice_what_is_tolerated_are_one():
     [(0.0, True), (0.04, True), (5.0, False)],
     ids=["same", "in doubt", "elsewhere"],
 )
-def test_poses_that_are_not_near_are_one_where_the_same_features_show_the_same_points(
-    moved: float, expected: bool
-):
+def test_distant_poses_with_the_same_matches_are_one(moved: float, expected: bool):
     """One pose is not precise yet. At two similar places, the same features match other points."""
     features = made_features(len(POINTS))
     one = made_fit(0.0, POINTS, features)
@@ -106,7 +104,7 @@ some_hypotheses = st.lists(hypotheses_of_nodes | hypotheses_of_walls, max_size=6
 
 
 @given(some_hypotheses)
-def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(
+def test_probabilities_of_exclusive_hypotheses_sum_to_at_most_one(
     hypotheses: list[Hypothesis],
 ):
     result = _answered(*hypotheses)
@@ -121,7 +119,7 @@ def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(
 
 
 @given(some_hypotheses)
-def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
+def test_a_reported_pose_leads_all_others(hypotheses: list[Hypothesis]):
     search = believed(hypotheses)
     result = lead(search).result
     if isinstance(result, Localization):
@@ -140,7 +138,7 @@ def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
     some_hypotheses.filter(lambda those: len({one.log_odds for one in those}) == len(those)),
     st.randoms(use_true_random=False),
 )
-def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(
+def test_the_result_does_not_depend_on_the_order_of_hypotheses(
     hypotheses: list[Hypothesis], random
 ):
     other_order = list(hypotheses)
@@ -159,7 +157,7 @@ def test_the_answer_does_not_depend_on_the_order_in_which_hypotheses_arrive(
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 1, 0), (0, 2, 1)], ids=str)
-def test_poses_that_lead_from_one_to_the_next_are_told_apart_in_the_same_way_in_any_order(
+def test_chains_of_near_poses_are_split_equally_in_any_order(
     order: tuple[int, ...],
 ):
     """The middle pose equals both ends, and the ends differ."""
@@ -187,10 +185,10 @@ def test_another_hypothesis_far_behind_takes_a_little_of_the_probability():
     assert beside.probability < alone.probability
 
 
-# two places that look alike
+# two similar places
 
 
-def test_two_places_that_look_alike_are_ambiguous_and_both_are_named():
+def test_two_similar_places_are_ambiguous_and_both_are_named():
     one, other = (
         made_hypothesis(4.0, fit=made_fit(0.0, POINTS, node_id=3)),
         made_hypothesis(3.8, fit=made_fit(9.0, POINTS, node_id=8)),
@@ -215,7 +213,7 @@ def test_two_places_that_look_alike_are_ambiguous_and_both_are_named():
     assert line["alternatives"][0]["probability"] == result.alternatives[0].probability
 
 
-def test_what_is_found_evenly_tells_two_poses_apart_that_have_the_same_odds():
+def test_spatial_uniformity_decides_between_poses_with_equal_odds():
     full, half = (
         made_hypothesis(5.0, even_share=0.2, doubt=0.1),
         made_hypothesis(5.0, x=9.0, even_share=0.02, doubt=0.5),
@@ -226,7 +224,7 @@ def test_what_is_found_evenly_tells_two_poses_apart_that_have_the_same_odds():
 @pytest.mark.parametrize(
     ("log_odds", "other", "is_answered"), [(3.0, 0.5, True), (3.0, 1.5, False), (6.0, 5.0, True)]
 )
-def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(
+def test_an_unclear_pose_must_also_lead_by_its_odds(
     log_odds: float, other: float, is_answered: bool
 ):
     """A place outside of the map may have as much evidence as a wrong place in the map."""
@@ -237,13 +235,13 @@ def test_a_pose_that_is_not_clear_must_lead_by_its_odds_too(
     assert isinstance(_answered(best, wrong), Localization) is is_answered
 
 
-# the walls along the way
+# virtual views
 
 
 @pytest.mark.parametrize(
     "of_nodes", [[], [made_hypothesis(-3.0)]], ids=["nothing", "hardly anything"]
 )
-def test_walls_are_believed_where_nodes_know_nothing(of_nodes: list[Hypothesis]):
+def test_virtual_views_are_reported_if_nodes_find_nothing(of_nodes: list[Hypothesis]):
     walls = [made_hypothesis(1.5, x=-9.0, walls=True), made_hypothesis(-2.0, x=4.0, walls=True)]
     result = _answered(*of_nodes, *walls)
     assert isinstance(result, Localization)
@@ -254,7 +252,7 @@ def test_walls_are_believed_where_nodes_know_nothing(of_nodes: list[Hypothesis])
 @pytest.mark.parametrize(
     ("log_odds", "is_answered"), [(2.0, False), (WEIGHTS.evidence.clear_log_odds + 0.1, True)]
 )
-def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_asks(
+def test_an_unclear_pose_must_lead_by_the_margin_of_its_feature_type(
     log_odds: float, is_answered: bool
 ):
     search = believed(
@@ -265,7 +263,7 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
     assert isinstance(lead(replace(search, weights=strict)).result, Localization) == is_answered
 
 
-def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
+def test_virtual_views_need_no_margin_of_unclear_node_poses():
     """Each of their points was compared with all other virtual views."""
     strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
     for walls in (True, False):
@@ -279,7 +277,7 @@ def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
 
 
 @pytest.mark.parametrize("doubt", [0.9, 1.5])
-def test_an_unclear_pose_of_nodes_must_lead_walls_by_far_only_if_they_could_be_answered(
+def test_unclear_node_poses_need_a_margin_only_over_reportable_virtual_views(
     doubt: float,
 ):
     strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
@@ -291,7 +289,7 @@ def test_an_unclear_pose_of_nodes_must_lead_walls_by_far_only_if_they_could_be_a
     assert isinstance(result, Localization) == (doubt > 1.0)
 
 
-def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
+def test_of_virtual_views_and_nodes_the_far_stronger_pose_is_reported():
     behind = 3.0 - WEIGHTS.rivals.lead - 0.1
     assert _along(
         _answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))
@@ -302,7 +300,7 @@ def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
 
 
 @pytest.mark.parametrize("ahead", [-0.9, 0.0, 0.9])
-def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float):
+def test_a_node_pose_that_virtual_views_contradict_is_ambiguous(ahead: float):
     result = _answered(
         made_hypothesis(2.0), made_hypothesis(2.0 + ahead * WEIGHTS.rivals.lead, x=-9.0, walls=True)
     )
@@ -317,7 +315,7 @@ def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float
 @pytest.mark.parametrize(
     "of_nodes", [[], [made_hypothesis(2.0)]], ids=["without nodes", "with nodes"]
 )
-def test_two_walls_that_look_alike_are_no_answer(of_nodes: list[Hypothesis]):
+def test_two_similar_virtual_views_give_no_pose(of_nodes: list[Hypothesis]):
     walls = [
         made_hypothesis(3.0, x=-9.0, walls=True),
         made_hypothesis(3.0 - 0.9 * WEIGHTS.rivals.lead, x=4.0, walls=True),
@@ -327,13 +325,13 @@ def test_two_walls_that_look_alike_are_no_answer(of_nodes: list[Hypothesis]):
     assert result.reason == "ambiguous"
 
 
-def test_walls_that_do_not_lead_a_hypothesis_of_the_nodes_are_no_answer_though_that_is_not_believed_itself():  # noqa: E501
+def test_virtual_views_that_do_not_lead_an_unreported_node_pose_give_no_pose():
     unlikely = made_hypothesis(-0.1)
     assert unlikely.probability < CONFIG.min_probability
     assert isinstance(_answered(unlikely, made_hypothesis(1.5, x=-9.0, walls=True)), NotLocalized)
 
 
-def test_a_place_beyond_doubt_but_imprecise_is_not_answered():
+def test_a_certain_but_imprecise_place_is_not_reported():
     evidence = Evidence(
         150, 40, 60, 200, 12, spread=0.5, doubt=0.3, even_share=0.2, num_distinct=30
     )
@@ -348,10 +346,10 @@ def test_a_place_beyond_doubt_but_imprecise_is_not_answered():
     assert imprecise.detail.startswith("in the map, but where is known to")
 
 
-# nothing to believe
+# no probable hypothesis
 
 
-def test_hypotheses_that_are_not_probable_are_no_answer():
+def test_improbable_hypotheses_give_no_pose():
     result = _answered(made_hypothesis(-2.0, x=4.0), made_hypothesis(-0.5, x=-9.0, walls=True))
     assert isinstance(result, NotLocalized)
     assert result.reason == "not_in_map"
@@ -369,7 +367,7 @@ def test_without_a_hypothesis_there_is_none_to_name():
     assert Belief().best(WEIGHTS.rivals) is None
 
 
-def test_a_search_that_was_cut_short_says_so():
+def test_a_stopped_search_is_reported():
     imprecise = replace(
         made_hypothesis(-1.0),
         evidence=Evidence(150, 90, 300, 1700, 20, spread=0.8, doubt=40.0, even_share=0.15),
@@ -383,17 +381,17 @@ def test_a_search_that_was_cut_short_says_so():
         assert "time was up" in result.detail
 
 
-def test_what_is_asked_of_an_answer_can_be_set():
+def test_the_conditions_of_a_reported_pose_can_be_set():
     strict = LocalizerConfig(evidence=EvidenceConfig(min_probability=0.95))
     for log_odds, is_answer in ((2.0, False), (4.0, True)):
         result = lead(believed([made_hypothesis(log_odds)], strict)).result
         assert isinstance(result, Localization) is is_answer
 
 
-# when nothing else is asked
+# when the search ends
 
 
-def test_it_is_settled_where_it_is_clear_and_no_other_place_comes_near():
+def test_a_search_is_settled_if_its_pose_is_clear_without_a_rival():
     clear = made_hypothesis(8.0)
     assert believed([clear]).is_settled
     assert believed([clear, made_hypothesis(-5.0, x=9.0, even_share=0.01)]).is_settled

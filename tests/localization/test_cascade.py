@@ -84,7 +84,7 @@ def _is_right(result: Localization | NotLocalized, truth=TRUTH, metres: float = 
     )
 
 
-def test_a_clear_picture_is_never_asked_for_the_second_kind(
+def test_a_clear_image_never_needs_the_second_feature_type(
     topomap: TopoMetricMap, changed: Callable[..., list[int]]
 ):
     asked = {kind: changed(kind, lambda features: features) for kind in ("surf", "sift")}
@@ -95,7 +95,7 @@ def test_a_clear_picture_is_never_asked_for_the_second_kind(
     assert (len(asked["surf"]), len(asked["sift"])) == (len(unseen_views()), 0)
 
 
-def test_where_another_place_is_nearly_as_likely_the_second_kind_is_asked(
+def test_a_nearly_as_likely_place_needs_the_second_feature_type(
     topomap: TopoMetricMap, changed: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
 ):
     """Even a clear pose may be a similar place for the first feature type."""
@@ -108,7 +108,7 @@ def test_where_another_place_is_nearly_as_likely_the_second_kind_is_asked(
 
 
 @pytest.mark.parametrize("says", [2.0, -20.0], ids=["yes", "no"])
-def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_not_sure_of(
+def test_the_second_feature_type_checks_an_unsettled_expected_pose(
     topomap: TopoMetricMap,
     changed: Callable[..., list[int]],
     monkeypatch: pytest.MonkeyPatch,
@@ -122,7 +122,7 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
         lambda search, hypothesis: (says, None),
     )
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), (
-        "it is settled: nobody else is heard"
+        "it is settled: no other feature type is used"
     )
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
@@ -130,7 +130,7 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
 
 
 @pytest.mark.parametrize(("more", "answers"), [(100.0, "sift"), (-100.0, "surf")])
-def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
+def test_a_common_pose_is_reported_by_the_type_with_higher_odds(
     topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, more: float, answers: str
 ):
     """In other light, the first feature type matches points by chance around any pose that
@@ -172,7 +172,7 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_other_features(
     assert "the calibration is doubtful" in result.detail
 
 
-def test_what_the_first_kind_leaves_open_the_second_answers(
+def test_the_second_feature_type_localizes_unclear_images(
     topomap: TopoMetricMap, changed: Callable[..., list[int]]
 ):
     changed("surf", _useless)
@@ -185,7 +185,7 @@ def test_what_the_first_kind_leaves_open_the_second_answers(
     assert len(asked) == 1
 
 
-def test_the_second_begins_with_the_poses_that_the_first_left_open(
+def test_the_second_feature_type_begins_with_poses_of_the_first(
     topomap: TopoMetricMap, changed: Callable[..., list[int]]
 ):
     for kind in ("surf", "sift"):
@@ -193,12 +193,12 @@ def test_the_second_begins_with_the_poses_that_the_first_left_open(
     trace = Trace()
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, trace=trace))
     sizes = [tried.first.features.descriptors.shape[1] for tried in trace.tried]
-    assert [size for size, _ in groupby(sizes)] == [64, 128]  # SURF, then SIFT, whose answer stands
+    assert [size for size, _ in groupby(sizes)] == [64, 128]  # SURF, then SIFT, which localizes it
     assert "other features" in {tried.source for tried in trace.tried}
 
 
 @pytest.mark.parametrize("agrees", [True, False])
-def test_dense_descriptors_tell_what_is_found_of_what_must_be_in_view(
+def test_dense_descriptors_count_found_points_in_view(
     topomap: TopoMetricMap,
     changed: Callable[..., list[int]],
     monkeypatch: pytest.MonkeyPatch,
@@ -226,7 +226,7 @@ def test_dense_descriptors_tell_what_is_found_of_what_must_be_in_view(
     assert even_share > 0.6 if agrees else even_share < 0.1
 
 
-def test_what_is_not_the_place_is_refused_by_both(
+def test_out_of_map_images_are_refused_by_both_types(
     topomap: TopoMetricMap, changed: Callable[..., list[int]]
 ):
     asked = changed("sift", lambda features: features)
@@ -238,7 +238,7 @@ def test_what_is_not_the_place_is_refused_by_both(
     assert len(asked) == 1 + len(elsewhere)
 
 
-def test_time_that_is_up_asks_no_second_kind(
+def test_after_the_time_limit_no_second_type_is_used(
     topomap: TopoMetricMap, changed: Callable[..., list[int]]
 ):
     asked = changed("sift", lambda features: features)
@@ -247,7 +247,7 @@ def test_time_that_is_up_asks_no_second_kind(
     assert not asked
 
 
-def test_threads_share_a_localizer_of_two_kinds(
+def test_threads_share_a_localizer_of_two_feature_types(
     topomap: TopoMetricMap, changed: Callable[..., list[int]]
 ):
     changed("surf", lambda features: _useless(features) if len(features) % 2 else features)
@@ -266,7 +266,7 @@ def test_threads_share_a_localizer_of_two_kinds(
 @pytest.mark.parametrize(
     "of_surf", [lambda features: features, _useless], ids=["clear", "by the second kind"]
 )
-def test_a_stream_goes_through_a_map_of_two_kinds(
+def test_a_stream_goes_through_a_map_of_two_feature_types(
     topomap: TopoMetricMap, changed: Callable[..., list[int]], of_surf: Change
 ):
     changed("surf", of_surf)
@@ -277,7 +277,7 @@ def test_a_stream_goes_through_a_map_of_two_kinds(
         assert _is_right(streamed.result, truth, 0.03)
 
 
-# kinds that cannot be asked
+# missing feature types
 
 
 @pytest.fixture
@@ -298,7 +298,7 @@ def learned_map(
 
 
 @pytest.mark.parametrize("kinds", [("surf", "xfeat"), ("xfeat", "surf")], ids=" then ".join)
-def test_a_kind_whose_network_is_not_here_is_left_out_and_named(
+def test_a_feature_type_without_its_network_is_skipped_and_named(
     learned_map: Callable[..., TopoMetricMap], kinds: tuple[str, str]
 ):
     topomap = learned_map(kinds[0], kinds[1:])
@@ -312,18 +312,18 @@ def test_a_kind_whose_network_is_not_here_is_left_out_and_named(
         Localizer(topomap, LocalizerConfig(kinds=("surf", "xfeat")))
 
 
-def test_a_map_that_cannot_be_asked_at_all_says_why(learned_map: Callable[..., TopoMetricMap]):
+def test_a_map_without_usable_feature_types_is_an_error(learned_map: Callable[..., TopoMetricMap]):
     with pytest.raises(WeightsError, match="xfeat is not here"):
         Localizer(learned_map("xfeat", ()))
 
 
-def test_nothing_is_left_out_of_a_map_whose_kinds_are_here(topomap: TopoMetricMap):
+def test_a_map_with_all_networks_skips_nothing(topomap: TopoMetricMap):
     assert Localizer(topomap).unavailable_types == {}
     with pytest.raises(FeatureTypeError, match=r"no features xfeat|no features orb|kind 'orb'"):
         Localizer(topomap, LocalizerConfig(kinds=("orb",)))
 
 
-def test_a_picture_is_out_of_memory_when_it_is_answered(topomap: TopoMetricMap):
+def test_an_image_is_freed_with_its_result(topomap: TopoMetricMap):
     """The memory is free without the garbage collector, which runs rarely in a large service."""
     localizer = Localizer(topomap)
     gc.collect()

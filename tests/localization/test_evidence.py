@@ -32,8 +32,8 @@ STRONG = Evidence(
     doubt=0.1,
     even_share=0.15,
 )
-# What peers accept: scores of inliers, though nearly all that the pose predicts is missing, and
-# chance finds as many.
+# Peers accept this pose for its inliers, though nearly all predicted points are missing, and chance
+# finds as many.
 MANY_OF_VERY_MANY = Evidence(
     num_matches=40,
     num_inliers=6,
@@ -66,7 +66,7 @@ def _probability(evidence: Evidence, weights: FittedWeights) -> float:
 
 
 @given(evidences)
-def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence):
+def test_more_evidence_never_lowers_the_probability(evidence: Evidence):
     log_odds = WEIGHTS.log_odds(evidence)
     assert math.isfinite(log_odds)
     for better in (
@@ -84,11 +84,11 @@ def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence)
         assert WEIGHTS.log_odds(worse) <= log_odds
 
 
-def test_strong_evidence_is_believed():
+def test_strong_evidence_is_accepted():
     assert _probability(STRONG, WEIGHTS) > 0.97
 
 
-def test_many_found_of_very_many_that_should_be_is_still_improbable():
+def test_many_matches_of_very_many_visible_points_are_improbable():
     assert _probability(MANY_OF_VERY_MANY, WEIGHTS) < 0.3
 
 
@@ -105,7 +105,7 @@ def test_no_single_part_of_the_evidence_carries_a_pose(weaker: dict[str, float])
     assert _probability(replace(STRONG, **weaker), WEIGHTS) < 0.7
 
 
-def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stand_on():
+def test_an_imprecise_pose_is_distinguished_from_one_without_evidence():
     small = replace(
         STRONG,
         num_inliers=24,
@@ -126,7 +126,7 @@ def test_indoors_less_is_tolerated():
     assert compute_translation_tolerance(2.0, CONFIG) == pytest.approx(0.1)
 
 
-def test_doubt_is_one_where_the_worst_direction_is_as_uncertain_as_is_tolerated():
+def test_normalized_uncertainty_is_one_at_the_tolerance_in_the_worst_direction():
     metres = np.diag([1e-6, 0.25**2, 1e-6, 1e-12, 1e-12, 1e-12])
     radians = np.diag([1e-12, 1e-12, 1e-12, 1e-9, 1e-9, np.deg2rad(2.0) ** 2])
     assert compute_normalized_uncertainty(metres, 20.0, CONFIG) == pytest.approx(1.0, abs=1e-3)
@@ -148,7 +148,7 @@ def test_spread_counts_cells_not_points():
     ) == pytest.approx(2 / 48)
 
 
-def test_points_found_everywhere_are_a_larger_even_share_than_as_many_in_one_half():
+def test_points_found_everywhere_are_more_uniform_than_in_one_half():
     visible = np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (2000, 2))
     everywhere, in_left_half = visible[:200], visible[visible[:, 0] < 320.0][:200]
     even, uneven = (
@@ -185,22 +185,22 @@ MORE = {
 
 
 @pytest.mark.parametrize("evidence", MORE.values(), ids=MORE.keys())
-def test_more_evidence_of_walls_means_better_odds(evidence: Evidence):
+def test_more_evidence_of_virtual_views_raises_the_odds(evidence: Evidence):
     assert WEIGHTS.log_odds(evidence) > WEIGHTS.log_odds(OF_WALLS) + 0.1
 
 
-def test_both_walls_say_more_than_one_of_them():
+def test_both_virtual_views_are_more_evidence_than_one():
     weights = load_fitted_weights("topoloc-net-sides")
     by_both, by_one = (weights.log_odds(replace(OF_WALLS, num_lesser_side=num)) for num in (30, 1))
     assert by_both > by_one + 1.0
 
 
-def test_no_evidence_of_walls_at_all_is_odds_all_the_same():
+def test_no_evidence_of_virtual_views_gives_low_odds():
     nothing = Evidence(0, 0, 0, 0, 0, spread=0.0, doubt=50.0, even_share=0.0, num_distinct=0)
     assert WEIGHTS.log_odds(nothing) < -5.0
 
 
-def test_only_a_pose_by_the_walls_is_asked_for_its_precision_beside_its_odds():
+def test_only_a_pose_of_virtual_views_needs_precision_beside_its_odds():
     assert replace(STRONG, doubt=8.0).precision_probability == 1.0
     assert replace(OF_WALLS, doubt=1.0).precision_probability == pytest.approx(
         0.6827, abs=1e-4

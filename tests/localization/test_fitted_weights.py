@@ -17,7 +17,7 @@ from topoloc.localization.fitted_weights import WEIGHTS_FOLDER, load_fitted_weig
 
 
 @pytest.mark.parametrize("path", sorted(WEIGHTS_FOLDER.iterdir()), ids=lambda path: path.name)
-def test_every_file_that_ships_is_of_a_kind_and_says_where_it_comes_from(path: Path):
+def test_each_shipped_file_has_a_feature_type_and_a_source(path: Path):
     weights = load_fitted_weights(path.stem)
     assert weights.kind == path.stem
     assert find_feature_type(weights.kind).name == weights.kind
@@ -28,13 +28,13 @@ def test_every_file_that_ships_is_of_a_kind_and_says_where_it_comes_from(path: P
     assert weights.command
 
 
-def test_what_is_written_is_read_again(tmp_path: Path):
+def test_written_weights_are_read_again(tmp_path: Path):
     path = tmp_path / "surf.json"
     path.write_text(json.dumps(load_fitted_weights("surf").to_json()))
     assert read_weights(path) == load_fitted_weights("surf")
 
 
-def test_a_kind_without_a_file_takes_those_of_surf_and_is_not_calibrated():
+def test_a_type_without_a_file_uses_surfs_weights_and_is_not_calibrated():
     stand_in = load_fitted_weights("no such kind")
     assert not stand_in.is_calibrated
     assert stand_in.evidence == load_fitted_weights("surf").evidence
@@ -85,7 +85,7 @@ def _changed(change: Callable[[dict[str, Any]], Any]) -> str:
         ),
     ],
 )
-def test_a_damaged_file_is_told_in_one_line(text: str, said: str, tmp_path: Path):
+def test_a_damaged_file_is_one_line(text: str, said: str, tmp_path: Path):
     path = tmp_path / "surf.json"
     path.write_text(text)
     with pytest.raises(FeatureTypeError, match=re.escape(said)) as raised:

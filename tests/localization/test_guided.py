@@ -95,7 +95,7 @@ def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
 
 
 @pytest.mark.parametrize("wrong", [{"shift_px": 25.0}, {"turn": 1.2}, {"scale": 2.0}])
-def test_what_is_elsewhere_or_turned_or_of_another_size_is_no_match(wrong: dict[str, float]):
+def test_distant_rotated_or_scaled_key_points_are_no_match(wrong: dict[str, float]):
     node = _node(np.random.default_rng(1))
     matches = match_guided(
         _seen(node, POSES[0], **wrong), LocalMap.of_node(node), POSES[0], CAMERA, GUIDED
@@ -123,7 +123,7 @@ def test_chance_finds_next_to_nothing_among_descriptors_that_differ():
     assert count_chance_matches(features, LocalMap.of_node(node), POSES[0], CAMERA, GUIDED) < 5
 
 
-def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
+def test_chance_finds_as_many_matches_among_equal_descriptors():
     node = _node(np.random.default_rng(5))
     same = np.tile(node.features.descriptors[:1], (NUM_POINTS, 1))
     alike = replace(
@@ -143,7 +143,7 @@ def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
     assert by_chance > 0.5 * found > 10
 
 
-def test_a_kind_without_scale_and_angle_is_matched_however_large_and_turned():
+def test_a_type_without_scale_and_angle_matches_any_size_and_rotation():
     node = _node(np.random.default_rng(6))
     plain = GuidedConfig().resolved(replace(SURF, has_scale=False, has_angle=False))
     cam_from_world = POSES[1] @ POSES[0]
@@ -159,7 +159,7 @@ def test_a_kind_without_scale_and_angle_is_matched_however_large_and_turned():
     ) < 0.3 * len(matches)
 
 
-def test_a_lens_without_distortion_expects_points_where_one_with_next_to_none_does():
+def test_a_pinhole_predicts_the_pixels_of_a_barely_distorted_camera():
     """A kernel projects one camera, the camera model the other. Some points lie behind the camera
     or outside of the image."""
     local_map = LocalMap.of_node(_node(np.random.default_rng(5)))

@@ -49,7 +49,7 @@ def test_unseen_pictures_of_the_place_are_localized_within_two_centimetres(local
     assert np.mean(within) >= 0.95
 
 
-def test_a_localization_says_what_it_stands_on(localizer: Localizer):
+def test_a_localization_contains_its_evidence(localizer: Localizer):
     result = localizer.localize(PICTURE, CAMERA)
     assert isinstance(result, Localization)
     assert 12 <= result.num_inliers <= result.num_matches
@@ -139,7 +139,7 @@ def test_any_number_of_candidates(num_candidates: int, localizer: Localizer):
         "other world 3",
     ],
 )
-def test_what_is_not_the_place_is_not_localized(picture: np.ndarray, localizer: Localizer):
+def test_out_of_map_images_are_not_localized(picture: np.ndarray, localizer: Localizer):
     result = localizer.localize(picture, CAMERA)
     assert isinstance(result, NotLocalized)
     assert result.reason in ("too_few_matches", "too_few_inliers", "not_in_map")
@@ -160,7 +160,7 @@ def test_a_camera_of_another_size_is_an_error(localizer: Localizer):
         localizer.localize(PICTURE, CAMERA.rescaled(640, 480))
 
 
-def test_a_map_without_nodes_cannot_be_asked(localizer: Localizer):
+def test_a_map_without_nodes_cannot_be_queried(localizer: Localizer):
     with pytest.raises(EmptyMapError, match="no nodes"):
         Localizer(replace(localizer.topomap, summaries=[]))
 
@@ -195,7 +195,7 @@ def test_a_coarse_localizer_of_one_s_own_answers_instead_of_the_map_s(localizer:
     assert [candidate.node_id for candidate in result.candidates] == [0, 1]
 
 
-def test_an_unknown_coarse_localizer_names_those_there_are(localizer: Localizer):
+def test_an_unknown_coarse_localizer_is_an_error_that_lists_all(localizer: Localizer):
     with pytest.raises(MapError, match=r"'netvlad' \(it has: surf-vlad\)"):
         Localizer(localizer.topomap, LocalizerConfig(coarse="netvlad"))
     with pytest.raises(MapError, match="it has: none"):
@@ -211,7 +211,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
 @pytest.mark.parametrize(
     "picture", [*(picture for picture, _ in unseen_views(step=4.0)), NOISE, np.zeros_like(NOISE)]
 )
-def test_without_any_time_the_first_hypothesis_is_answered_or_it_is_said_that_time_was_up(
+def test_without_time_the_first_hypothesis_or_the_time_limit_is_reported(
     picture: np.ndarray, localizer: Localizer
 ):
     trace = Trace()
@@ -232,13 +232,13 @@ def test_a_query_s_own_time_comes_before_that_of_the_settings(localizer: Localiz
     ] == [True, False, False]
 
 
-# what was tried
+# the trace
 
 
 @pytest.mark.parametrize(
     "picture", [PICTURE, (0.05 * PICTURE).astype(np.uint8), NOISE], ids=["here", "dark", "noise"]
 )
-def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(
+def test_the_trace_contains_all_proposals_and_explains_the_result(
     picture: np.ndarray, localizer: Localizer
 ):
     localizer = Localizer(localizer.topomap, LocalizerConfig(exactness="fast"))
@@ -272,14 +272,14 @@ def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(
         )
 
 
-def test_who_is_traced_gets_the_same_answer(localizer: Localizer):
+def test_a_trace_does_not_change_the_result(localizer: Localizer):
     assert _facts(localizer.localize(PICTURE, CAMERA, trace=Trace())) == _facts(
         localizer.localize(PICTURE, CAMERA)
     )
 
 
 @pytest.mark.parametrize("kind", ["matrix", "tuple", "list", "text", "path"])
-def test_a_camera_may_be_given_as_people_have_it(localizer: Localizer, kind: str, tmp_path: Path):
+def test_a_camera_may_be_given_in_several_forms(localizer: Localizer, kind: str, tmp_path: Path):
     four = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(CAMERA.to_json()))
@@ -299,7 +299,7 @@ def test_a_camera_may_be_given_as_people_have_it(localizer: Localizer, kind: str
 
 
 @pytest.mark.parametrize("given", [(1.0, 2.0), np.eye(4)])
-def test_what_is_no_camera_is_named(localizer: Localizer, given: Any):
+def test_an_invalid_camera_is_named(localizer: Localizer, given: Any):
     with pytest.raises(QueryError, match=r"a 3x3 matrix K, \(fx, fy, cx, cy\) in pixels"):
         localizer.localize(PICTURE, given)
 

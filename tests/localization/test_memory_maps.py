@@ -68,7 +68,7 @@ def test_single_pictures_without_poses_need_more(tiny_recording: Path):
         topoloc.build_map(topoloc.MemorySequence(frames), SURF_ALONE)
 
 
-def test_pictures_and_times_of_another_kind_are_refused(room_map: Path):
+def test_images_and_times_of_another_type_are_refused(room_map: Path):
     """The calls run in another process, because the shape checks of the tests would raise first."""
     program = """
 import sys, numpy as np, topoloc

@@ -13,7 +13,7 @@ NODES = NodePoses.from_poses(
 )
 
 
-def test_upright_cameras_are_as_far_as_eq_1_says():
+def test_distances_of_upright_cameras_equal_eq_1():
     camera = Rigid3(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.0, 0.0, 2.0]))
     np.testing.assert_array_equal(
         node_distances_for_any_roll(camera, NODES, 3.0), node_distances(camera, NODES, 3.0)

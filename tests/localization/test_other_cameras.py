@@ -37,7 +37,7 @@ def _is_right(result: object, truth: Rigid3, metres: float = 0.03) -> bool:
 
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.4, 1.8])
 @pytest.mark.parametrize("size", [(320, 240), (480, 300)], ids=str)
-def test_other_lenses_and_other_sizes(factor: float, size: tuple[int, int], localizer: Localizer):
+def test_other_focal_lengths_and_sizes(factor: float, size: tuple[int, int], localizer: Localizer):
     width, height = size
     focal = CAMERA.fx * factor * height / CAMERA.height
     camera = Camera.pinhole(width, height, focal, focal, width / 2 - 3.0, height / 2 + 2.0)
@@ -111,7 +111,7 @@ def test_rolled_cameras(degrees: int, localizer: Localizer):
     )
 
 
-def test_a_camera_that_nobody_has_calibrated(localizer: Localizer):
+def test_an_uncalibrated_camera(localizer: Localizer):
     results = [(localizer.localize(picture, None), truth) for picture, truth in unseen_views()]
     found = [(result, truth) for result, truth in results if isinstance(result, Localization)]
     assert len(found) >= 0.8 * len(results)
@@ -140,7 +140,7 @@ def test_an_unknown_focal_length_makes_the_pose_less_certain(localizer: Localize
     assert np.trace(unknown.camera_covariance[:3, :3]) > np.trace(known.camera_covariance[:3, :3])
 
 
-def test_noise_is_not_made_a_place_by_leaving_the_focal_length_open(localizer: Localizer):
+def test_noise_is_not_localized_with_a_free_focal_length(localizer: Localizer):
     rng = np.random.default_rng(0)
     pictures = [rng.integers(0, 256, (240, 320), dtype=np.uint8) for _ in range(5)]
     pictures += [picture for picture, _ in unseen_views(seed=1, step=4.0)]

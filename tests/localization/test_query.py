@@ -55,7 +55,7 @@ def test_a_rough_camera_is_finer_as_far_as_its_whole_range_is():
     assert lens == UncalibratedCamera(320, 240, 300.0, 750.0)
 
 
-def test_a_picture_of_hardly_a_pixel_keeps_one():
+def test_a_reduced_image_has_at_least_one_pixel():
     reduced, _ = reduce_image(
         IMAGE[:2, :40], Camera.pinhole(40, 2, 9000.0, 9000.0, 19.5, 0.5), MAP_FOCAL, 1.15, 1600
     )
@@ -68,7 +68,7 @@ def test_a_camera_of_another_size_is_an_error():
         check_image_size(RGB, UncalibratedCamera.unknown(480, 640))
 
 
-def test_features_are_extracted_when_first_wanted_and_once():
+def test_features_are_extracted_at_first_use_and_once():
     query = Query(IMAGE, _camera(300.0), 1.0, FeatureConfig())
     assert "features" not in query.clock.times_ms()
     features = query.features
@@ -89,7 +89,7 @@ def test_a_query_is_late_from_its_deadline_on():
     assert later.is_past
 
 
-def test_of_a_camera_that_is_roughly_known_the_likeliest_stands_in():
+def test_an_approximate_camera_is_replaced_by_its_likeliest():
     assert Query(IMAGE, _camera(300.0), 1.0, FeatureConfig()).camera == _camera(300.0)
     uncalibrated = UncalibratedCamera(640, 480, 200.0, 1500.0)
     assert 200.0 < Query(IMAGE, uncalibrated, 1.0, FeatureConfig()).camera.fx < 1500.0

@@ -84,7 +84,7 @@ def test_a_refusal_as_json_never_holds_a_pose():
     assert json.loads(json.dumps(line)) == line
 
 
-def test_detail_and_alternatives_are_there_though_empty():
+def test_empty_detail_and_alternatives_are_written():
     assert (
         NotLocalized("unreadable", detail="a.png: the file is empty").to_json("a.png")["detail"]
         == "a.png: the file is empty"
@@ -110,12 +110,12 @@ def test_the_cameras_own_covariance_is_that_of_a_perturbation_on_its_side():
     np.testing.assert_allclose(result.position_covariance, np.cov(positions.T), atol=2e-5)
 
 
-def test_a_probability_that_is_not_calibrated_says_so():
+def test_an_uncalibrated_probability_is_marked():
     result = Localization(POSE, np.eye(6), 0.9, 0, [], 1, 1, calibrated=False)
     assert result.to_json("a.png")["calibrated"] is False
 
 
-def test_an_ambiguity_names_its_alternatives_but_no_answer():
+def test_an_ambiguity_has_alternatives_but_no_pose():
     alternatives = (Alternative(POSE, 0.5, 3), Alternative(POSE.inverse(), 0.4, 8))
     line = NotLocalized(
         "ambiguous",

@@ -93,7 +93,7 @@ def rounded(value: Any) -> Any:
     return round(value, 12) if isinstance(value, float) else value
 
 
-def test_the_schema_is_one():
+def test_the_schema_is_valid():
     Draft202012Validator.check_schema(SCHEMA)
 
 
@@ -109,7 +109,7 @@ def test_the_schema_is_one():
         NotLocalized("unreadable"),
     ],
 )
-def test_what_was_written_comes_again(result: Localization | NotLocalized):
+def test_written_results_are_read_again(result: Localization | NotLocalized):
     text = json.dumps(result.to_json("a.png"), allow_nan=False)
     check_result(json.loads(text))
     again = result_from_json(text)
@@ -119,7 +119,7 @@ def test_what_was_written_comes_again(result: Localization | NotLocalized):
     assert again.to_json("b.png")["query"] == "b.png"
 
 
-def test_what_was_suspected_is_known_again():
+def test_calibration_faults_are_read_again():
     again = Localization.from_json(SUSPECTED.to_json("a.png"))
     assert again.evidence == SUSPECTED.evidence
     assert again.noise_share == 0.25
@@ -140,7 +140,7 @@ def test_what_was_suspected_is_known_again():
         {"calibration_doubt": SUSPECTED.to_json("a")["calibration_doubt"] | {"of": "focal_length"}},
     ],
 )
-def test_what_is_no_evidence_or_doubt(broken: dict[str, Any]):
+def test_invalid_evidence_is_refused(broken: dict[str, Any]):
     with pytest.raises(ResultError, match="no result"):
         Localization.from_json(SUSPECTED.to_json("a") | broken)
 
@@ -167,7 +167,7 @@ def test_real_results_fit_the_schema(tiny_recording: Path):
     check_result(rough.to_json("c.png"))
 
 
-def test_streams_fit_the_schema_and_say_their_times(tiny_recording: Path):
+def test_streams_fit_the_schema_and_have_times(tiny_recording: Path):
     tracker = Tracker(Localizer(replace(built_room(tiny_recording), georeference=PLACE)))
     views = unseen_views(step=0.5)[:4]
     lines = [
@@ -183,7 +183,7 @@ def test_streams_fit_the_schema_and_say_their_times(tiny_recording: Path):
     check_result(tracker.process_missing(10**9, NotLocalized("unreadable")).to_json("none"))
 
 
-def test_a_geopose_leads_back_to_the_pose():
+def test_a_geopose_gives_back_the_pose():
     geopose = PLACE.geopose(POSE)
     enu_from_ecef = PLACE.origin.ecef_from_enu().inverse()
     np.testing.assert_allclose(
@@ -239,12 +239,12 @@ def test_a_geopose_leads_back_to_the_pose():
         {**REFUSED.to_json(""), "alternatives": [3]},
     ],
 )
-def test_what_is_no_result_is_one_error(broken: Any):
+def test_an_invalid_result_is_one_error(broken: Any):
     with pytest.raises(ResultError, match="no result"):
         result_from_json(broken)
 
 
-def test_each_kind_of_result_refuses_the_other():
+def test_each_result_type_refuses_the_other():
     with pytest.raises(ResultError, match=r"NotLocalized\.from_json"):
         Localization.from_json(REFUSED.to_json(""))
     with pytest.raises(ResultError, match=r"[( ]Localization\.from_json"):

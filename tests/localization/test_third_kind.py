@@ -41,7 +41,7 @@ def path(registered: None, tiny_recording: Path, tmp_path_factory: pytest.TempPa
     return path
 
 
-def test_a_map_of_it_is_built_and_asked_from_its_file(path: Path):
+def test_a_map_of_it_is_built_and_queried_from_its_file(path: Path):
     localizer = Localizer(TopoMetricMap.load(path))
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
     within = [
@@ -57,7 +57,7 @@ def test_a_map_of_it_is_built_and_asked_from_its_file(path: Path):
     )
 
 
-def test_until_weights_are_fitted_its_answers_say_so(path: Path):
+def test_results_without_fitted_weights_are_marked(path: Path):
     topomap, (picture, _) = TopoMetricMap.load(path), unseen_views()[2]
     line = Localizer(topomap).localize(picture, CAMERA).to_json("")
     assert line["localized"] is True
@@ -82,7 +82,7 @@ def test_its_own_thresholds_are_used_unless_others_are_set(path: Path):
     assert config.guided.max_turn == np.inf  # it has no angles to look at
 
 
-def test_a_map_of_a_kind_that_is_not_there_is_refused_in_one_line(
+def test_a_map_of_an_unknown_feature_type_is_refused_in_one_line(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     topomap = TopoMetricMap.load(path)

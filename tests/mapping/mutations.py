@@ -90,7 +90,7 @@ def mutate(source: Path, target: Path, seed: int) -> str:
             script = SCRIPTS[rng.integers(len(SCRIPTS))]
             try:
                 database.executescript(script)
-            except sqlite3.Error as error:  # an SQLite without what it takes
+            except sqlite3.Error as error:  # this SQLite lacks a feature
                 return f"not possible: {error}"
             return script
         done = [_KINDS[rng.integers(len(_KINDS))](database, rng) for _ in range(rng.integers(1, 3))]

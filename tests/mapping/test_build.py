@@ -48,7 +48,7 @@ def test_nodes_follow_eq_1_and_every_image_belongs_to_the_nearest(tiny_map: Topo
     assert [node.summary.node_id for node in tiny_map.nodes] == list(range(len(tiny_map.nodes)))
 
 
-def test_a_map_whose_parts_lie_on_disk_while_it_is_made_is_the_same(
+def test_a_build_with_data_on_disk_gives_the_same_map(
     tiny_recording: Path, tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     replace(tiny_map.with_first_layer(shared_errors=None), repetitions=None).save(
@@ -79,7 +79,7 @@ def test_points_are_right_and_refined_better_than_measured(
     assert sigma_z < 0.9 * sigma_z_before
 
 
-def test_a_node_holds_what_the_paper_says(tiny_map: TopoMetricMap):
+def test_a_node_has_the_contents_of_the_paper(tiny_map: TopoMetricMap):
     node = tiny_map.nodes[1]
     assert (
         len(node.features)
@@ -105,7 +105,7 @@ def test_limits_on_points_are_kept(tiny_recording: Path, monkeypatch: pytest.Mon
     assert {summary.num_points for summary in few.summaries} == {50}
 
 
-def test_points_of_a_lidar_are_as_exact_as_they_say(tmp_path: Path):
+def test_points_of_a_lidar_are_as_exact_as_they_state(tmp_path: Path):
     """Lidar dots are interpolated to an eighth of the image, with 1 % of noise and smeared
     edges. Images farther away refine the points, although the nearest three nodes of each
     image are others."""
@@ -180,7 +180,7 @@ def test_two_builds_of_a_real_recording_give_the_same_bytes(shared: Path, tmp_pa
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
-def test_progress_is_told(tiny_recording: Path):
+def test_progress_is_reported(tiny_recording: Path):
     told: list[tuple[str, int, int]] = []
     build_node_map(
         topoloc.open_sequence(f"{tiny_recording}@0:3"), ALONE, lambda *step: told.append(step)
@@ -224,7 +224,7 @@ class CountedHalves(CountedReads):
         return read_left_frame(self.base, index)
 
 
-def test_the_right_picture_of_what_is_no_node_is_not_read(tiny_recording: Path):
+def test_right_images_of_other_frames_than_nodes_are_not_read(tiny_recording: Path):
     recording = CountedHalves(topoloc.open_sequence(f"{tiny_recording}@0:5"))
     names = {node.summary.name for node in build_node_map(recording, ALONE).nodes}
     assert 0 < len(names) < 5

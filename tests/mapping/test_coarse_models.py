@@ -40,7 +40,7 @@ def test_sessions_of_one_light_go_together():
     assert group_by_illumination(sessions, {1: 40, 0: 9}) == {1: 0, 0: 1, 2: 0, 3: 0}
 
 
-def test_names_decide_where_there_are_some():
+def test_names_of_light_decide_if_given():
     sessions = [
         _session(0, DAY, "noon"),
         _session(1, CLOUDS, "evening"),
@@ -84,7 +84,7 @@ def _asked(model: SurfVlad, vector: np.ndarray, words: np.ndarray) -> list[int]:
     return [score.row for score in model.rank(np.zeros((10, 10), np.uint8), features, 3)]
 
 
-def test_a_night_of_half_the_way_does_not_draw_the_other_half_to_itself():
+def test_a_night_session_of_half_the_path_does_not_attract_other_night_queries():
     rng = np.random.default_rng(0)
     places, shift = rng.normal(size=(30, 24)), np.eye(24)[0] * 9.0
     places[:, 0] = 0.0
@@ -105,7 +105,7 @@ def test_a_night_of_half_the_way_does_not_draw_the_other_half_to_itself():
     ), "too few to say anything"
 
 
-def test_a_map_of_one_light_is_asked_as_it_is(room_map: Path):
+def test_a_map_of_one_light_is_queried_unchanged(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
         (session,) = topomap.sessions
         assert (find_node_illumination_groups(topomap.summaries, topomap.sessions) == 0).all()

@@ -57,7 +57,7 @@ def _without_a_node(path: Path, changes: dict | None = None) -> None:
         edit.commit(changed, f"drop node {gone}", changes)
 
 
-def test_edits_are_taken_back_to_the_byte_the_last_one_first(map_file: Path):
+def test_edits_are_undone_byte_identically_the_last_one_first(map_file: Path):
     files = [map_file.read_bytes()]
     for k in range(3):
         _without_a_node(map_file, {"nodes": -1, "why": "a test"})
@@ -107,7 +107,7 @@ def test_the_oldest_files_go_beyond_the_limit(map_file: Path, monkeypatch: pytes
         assert len(_names(map_file)) == 1 + num_kept
 
 
-def test_a_map_of_an_older_schema_is_taken_back_whole(map_file: Path, tmp_path: Path):
+def test_a_map_of_an_older_schema_is_restored_completely(map_file: Path, tmp_path: Path):
     old = tmp_path / "old.topo"
     with TopoMetricMap.load(map_file) as topomap:
         write_schema_1(topomap, old)

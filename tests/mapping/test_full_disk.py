@@ -128,7 +128,7 @@ def test_with_few_file_handles_an_edit_is_one_line_or_done(edited: Path):
     assert outcomes == {"done", "refused"}
 
 
-def test_damage_is_told_from_a_full_disk(tmp_path: Path):
+def test_damage_is_distinguished_from_a_full_disk(tmp_path: Path):
     path = tmp_path / "some.db"
     with closing(sqlite3.connect(path, isolation_level=None)) as database:
         database.execute("CREATE TABLE t (a BLOB)")

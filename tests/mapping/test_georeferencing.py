@@ -75,7 +75,7 @@ def test_up_is_the_axis_that_the_cameras_have_up():
 
 
 @given(heading=st.floats(0, 359), pitch=st.floats(-1.2, 1.2))
-def test_the_first_picture_looks_where_it_is_said_to(heading: float, pitch: float):
+def test_the_first_image_has_the_given_heading(heading: float, pitch: float):
     world_from_cam = Rigid3(
         Z_UP_CAMERA @ exp_so3(np.array([pitch, 0.0, 0.0])), np.array([3.0, 4.0, 1.5])
     )
@@ -111,10 +111,10 @@ def test_known_points_give_any_world_back(angles: tuple[float, float, float]):
     assert fit.residuals_m.max() < 1e-4
 
 
-def test_gnss_is_believed_where_it_agrees():
+def test_gnss_is_used_except_for_outliers():
     way = np.repeat(WALK, 5, axis=0) + np.linspace(0, 0.5, 40)[:, None]
     places = places_of(way, noise=0.3)
-    for k in range(0, 40, 4):  # a wall
+    for k in range(0, 40, 4):  # outliers, as beside a wall
         places[k] = TRUE.geopoint(way[k] + [15.0, 5.0, 8.0])
     fit = fit_georeference(way, places, "gnss", Z_UP)
     assert list(np.flatnonzero(~fit.is_inlier)) == list(range(0, 40, 4))
@@ -124,7 +124,7 @@ def test_gnss_is_believed_where_it_agrees():
     assert fit.georeference.rms_m == pytest.approx(0.3 * math.sqrt(3.0), rel=0.25)
 
 
-def test_a_straight_walk_is_enough_where_up_is_known_and_not_where_it_is_not():
+def test_a_straight_walk_is_enough_only_with_a_known_up():
     line = np.column_stack([np.linspace(0, 60, 30), np.zeros(30), np.zeros(30)])
     fit = fit_georeference(line, places_of(line, noise=0.1), "gnss", Z_UP)
     assert off(fit.georeference)[1] < 3.0
@@ -137,7 +137,7 @@ def test_a_straight_walk_is_enough_where_up_is_known_and_not_where_it_is_not():
         fit_georeference(upright, places_of(upright, noise=0.1), "gnss", Z_UP)
 
 
-def test_what_cannot_be_the_maps_places_is_refused():
+def test_impossible_places_are_refused():
     with pytest.raises(GeoreferenceError, match="at least 3"):
         fit_georeference(WALK[:2], places_of(WALK[:2]), "points")
     with pytest.raises(GeoreferenceError, match="too close together"):

@@ -39,15 +39,13 @@ def test_any_flipped_bit_is_found_or_does_no_harm(saved: Path):
             harmed = ["cannot be opened"]
         if harmed:
             found += 1
-        else:  # a byte that nothing is read from: what is saved again is what it was
+        else:  # an unused byte: the saved copy is unchanged
             TopoMetricMap.load(saved).save(saved)
             assert saved.read_bytes() == content
     assert found > 0.8 * len(places)
 
 
-def test_damage_is_told_in_one_line_and_by_the_exit_status(
-    saved: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_damage_is_one_line_and_an_exit_status(saved: Path, capsys: pytest.CaptureFixture[str]):
     content = saved.read_bytes()
     place = content.index(TopoMetricMap.load(saved).nodes[1].template_image[:40]) + 20
     saved.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])

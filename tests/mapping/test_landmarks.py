@@ -65,7 +65,7 @@ def test_errors_shrink_and_covariances_stay_honest():
     assert np.median(after) < 0.3 * np.median(before)
     error = refined.points_cam - s.truth
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(refined.covariances), error)
-    # 3 on average were it exact; the robust weights make it a little too careful
+    # an exact covariance gives 3 on average, and the robust weights make it slightly larger
     assert 1.5 < nees.mean() < 3.6
     assert refined.is_consistent.mean() > 0.99
     assert refined.num_observations.sum() == sum(len(seen.rows) for seen in s.observations)
@@ -135,7 +135,7 @@ def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
     return seen, points_img
 
 
-def test_points_are_found_by_descriptor_where_they_must_be():
+def test_points_are_matched_by_descriptor_at_their_projections():
     seen, points_img = observed(np.zeros((60, 2)))
     assert sorted(seen.rows.tolist()) == list(range(60))
     np.testing.assert_allclose(

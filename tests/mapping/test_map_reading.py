@@ -77,9 +77,7 @@ def test_opening_reads_no_node(saved: Path):
     assert later.count("checksum FROM node_points WHERE") == 1
 
 
-def test_a_map_that_never_measured_its_shared_errors_says_so(
-    tiny_map: TopoMetricMap, tmp_path: Path
-):
+def test_a_map_without_measured_error_share_returns_none(tiny_map: TopoMetricMap, tmp_path: Path):
     tiny_map.with_first_layer(shared_errors=None).save(tmp_path / "older.topo")
     assert TopoMetricMap.load(tmp_path / "older.topo").first_layer.shared_errors is None
 

@@ -70,7 +70,7 @@ def test_descriptors_come_back_within_quantisation(tiny_map: TopoMetricMap, save
         assert np.median(cosines) > 0.999
 
 
-def test_each_kind_has_its_own_quantisation(
+def test_each_feature_type_has_its_own_quantisation(
     tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setitem(FEATURE_TYPES, "surf", replace(SURF, descriptor_scale=100.0))
@@ -130,7 +130,7 @@ def test_a_failed_write_leaves_the_old_map_and_nothing_else(
     before = path.read_bytes() if there_before else None
     monkeypatch.setattr(
         map_writing, "compute_map_digest", stop(error)
-    )  # asked for last, after all nodes are written
+    )  # called last, after all nodes are written
     with pytest.raises(MapError, match=r"cannot write map .*room\.topo: No space left"):
         tiny_map.save(path)
     assert (path.read_bytes() if path.exists() else None) == before
@@ -185,7 +185,7 @@ def with_bytes(path: Path, offset: int, data: bytes) -> Path:
     return path
 
 
-def test_files_that_are_no_map_are_told_apart(tmp_path: Path):
+def test_other_files_are_refused_with_their_kind(tmp_path: Path):
     with pytest.raises(MapError, match=r"cannot open map .*no\.topo: No such file"):
         TopoMetricMap.load(tmp_path / "no.topo")
     with pytest.raises(MapError, match="is no map but a folder"):

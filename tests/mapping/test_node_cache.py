@@ -9,7 +9,7 @@ import numpy as np
 from topoloc.mapping.node_cache import CachedNodes, NodeCache, bytes_of
 
 
-def test_what_was_used_longest_ago_is_let_go_over_all_owners():
+def test_the_least_recently_used_nodes_of_all_owners_are_dropped():
     memory, read = NodeCache(1000), []
 
     def reader(name: str) -> CachedNodes[np.ndarray]:
@@ -36,7 +36,7 @@ def test_what_was_used_longest_ago_is_let_go_over_all_owners():
     assert read[4:] == [("one", 0), ("one", 0)]
 
 
-def test_nodes_go_with_who_asked_for_them():
+def test_nodes_are_freed_with_their_owner():
     memory = NodeCache(10_000)
     remembered = CachedNodes(lambda row: np.zeros(100), memory)
     remembered(3)

@@ -47,7 +47,7 @@ def test_angle_is_that_of_the_relative_rotation_up_to_half_a_turn():
         assert distance == pytest.approx(angle, abs=1e-7)
 
 
-def test_a_straight_walk_places_a_node_where_the_threshold_is_passed():
+def test_a_straight_walk_places_a_node_at_each_passed_threshold():
     walk = [moved(0.25 * k) for k in range(9)]
     # 0.5 m is not more than the threshold of 0.5 m
     assert select_node_frames(walk, 0.5, 1.0).tolist() == [0, 3, 6]
@@ -79,9 +79,8 @@ def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(
     poses = [moved(x, yaw) for x, yaw in steps]
     frame_idx = select_node_frames(poses, d_thresh, lambda_rot)
     nodes = NodePoses.from_poses([poses[i] for i in frame_idx])
-    rounding = (
-        1.0 + 1e-12
-    )  # a step of 1e-124 from where a node just is none is seen in one order of the sums and not in the other  # noqa: E501
+    # a step of 1e-124 may count or not, depending on the order of the sums
+    rounding = 1.0 + 1e-12
     assert all(
         node_distances(pose, nodes, lambda_rot).min() <= d_thresh * rounding for pose in poses
     )

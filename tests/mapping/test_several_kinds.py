@@ -39,7 +39,7 @@ def path(of_two: TopoMetricMap, tmp_path: Path) -> Path:
     return tmp_path / "room.topo"
 
 
-def test_both_kinds_come_back_and_are_saved_again_to_the_byte(
+def test_both_feature_types_are_read_back_and_saved_byte_identically(
     of_two: TopoMetricMap, path: Path, tmp_path: Path
 ):
     loaded = TopoMetricMap.load(path)
@@ -62,14 +62,16 @@ def test_both_kinds_come_back_and_are_saved_again_to_the_byte(
     assert find_map_damage(path) == []
 
 
-def test_the_first_kind_is_what_it_would_be_alone(of_two: TopoMetricMap, tiny_map: TopoMetricMap):
+def test_the_first_feature_type_equals_a_map_of_it_alone(
+    of_two: TopoMetricMap, tiny_map: TopoMetricMap
+):
     assert len(of_two.nodes) == len(tiny_map.nodes)
     for one, other in zip(of_two.nodes, tiny_map.nodes, strict=True):
         np.testing.assert_array_equal(one.points_cam, other.points_cam)
         np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
 
 
-def test_a_damaged_point_of_the_second_kind_is_found(path: Path):
+def test_a_damaged_point_of_the_second_type_is_found(path: Path):
     content = path.read_bytes()
     with closing(sqlite3.connect(path)) as database:
         (packed,) = database.execute(
@@ -80,7 +82,7 @@ def test_a_damaged_point_of_the_second_kind_is_found(path: Path):
     assert any("node_points" in damage for damage in find_map_damage(path))
 
 
-def test_it_localizes_by_the_second_kind_alone(path: Path):
+def test_it_localizes_with_the_second_type_alone(path: Path):
     loaded = TopoMetricMap.load(path)
     assert loaded.sides_for("sift") is None
     localizer = Localizer(loaded, LocalizerConfig(kinds=("sift",)))
@@ -91,12 +93,12 @@ def test_it_localizes_by_the_second_kind_alone(path: Path):
     )
 
 
-def test_a_kind_that_it_does_not_hold_is_refused(of_two: TopoMetricMap):
+def test_a_feature_type_outside_of_the_map_is_refused(of_two: TopoMetricMap):
     with pytest.raises(FeatureTypeError, match=r"no features xfeat \(it holds: surf, sift\)"):
         OpenMap(of_two, kind="xfeat")
 
 
-def test_the_cells_of_a_network_are_learnt_kept_and_asked(
+def test_the_cells_of_a_network_are_learned_stored_and_used(
     tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     build_map(
@@ -123,7 +125,7 @@ def test_the_cells_of_a_network_are_learnt_kept_and_asked(
         assert asked == expected
 
 
-def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path):
+def test_missing_feature_types_are_an_error_before_the_work(tiny_recording: Path):
     for kinds, said in ((("orb",), FeatureTypeError), (("edgepoint2-s64",), WeightsError)):
         done: list[str] = []
         with pytest.raises(said):
@@ -135,7 +137,7 @@ def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path)
         assert not done
 
 
-def test_beside_surf_stand_the_learned_ones_unless_others_are_named():
+def test_learned_types_are_added_to_surf_unless_others_are_named():
     assert MapConfig().kinds == ["surf", default_learned_type()]
     assert MapConfig(other_kinds=("sift",)).kinds == ["surf", "sift"]
     sift = MapConfig(other_kinds=("sift",)).feature_config_for("sift")

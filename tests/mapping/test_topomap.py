@@ -93,7 +93,7 @@ def test_a_map_whose_ids_are_no_rows_localizes_and_reports_ids(renumbered: Path)
             assert result.candidates[0].node_id == 1000 + 10 * before.candidates[0].node_id
 
 
-def test_walls_of_a_map_whose_ids_are_no_rows_are_recognised(renumbered: Path):
+def test_virtual_views_of_a_map_whose_ids_are_no_rows_are_recognised(renumbered: Path):
     topomap = TopoMetricMap.load(renumbered)
     results = [Localizer(topomap).localize(picture, WIDE) for picture, _ in seen_on_the_way_back()]
     found = [result for result in results if isinstance(result, Localization)]
@@ -161,7 +161,7 @@ def test_two_recordings_of_one_name_are_two_sessions(tmp_path: Path):
         )
 
 
-def test_a_session_says_where_it_comes_from_and_what_its_light_was():
+def test_a_session_stores_its_source_and_its_light():
     (session,) = built_corridor().sessions
     assert (session.name, session.recording, session.poses_from) == ("walk", None, "given")
     assert (session.start_ns, session.end_ns, session.start_date) == (0, 1_300_000_000, None)
@@ -172,7 +172,7 @@ def test_a_session_says_where_it_comes_from_and_what_its_light_was():
     assert (session.light.red, session.light.blue) == (1.0, 1.0)
 
 
-def test_a_closed_map_says_so(renumbered: Path):
+def test_a_closed_map_raises_an_error(renumbered: Path):
     with TopoMetricMap.load(renumbered) as topomap:
         assert len(topomap.nodes[0].features) > 0
     with pytest.raises(MapError, match=r"corridor\.topo is closed"):
@@ -181,9 +181,7 @@ def test_a_closed_map_says_so(renumbered: Path):
     built_corridor().close()
 
 
-def test_a_map_is_pickled_as_its_path_and_knows_when_it_was_replaced(
-    renumbered: Path, tmp_path: Path
-):
+def test_a_map_is_pickled_as_its_path_and_detects_a_replaced_file(renumbered: Path, tmp_path: Path):
     path = tmp_path / "map.topo"
     path.write_bytes(renumbered.read_bytes())
     topomap = TopoMetricMap.load(path)

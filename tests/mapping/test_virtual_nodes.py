@@ -58,7 +58,7 @@ def depth_errors(node: TopoNode) -> np.ndarray:
     return node.points_cam[:, 2] - depth[rows, columns]
 
 
-def test_points_lie_where_the_side_camera_sees_them(sides: VirtualNodes):
+def test_points_lie_at_their_pixels_in_the_virtual_view(sides: VirtualNodes):
     for node in sides.nodes:
         errors = depth_errors(node)
         assert abs(np.nanmedian(errors)) < 0.01
@@ -87,13 +87,13 @@ def test_covariances_cover_the_errors_and_are_turned_with_the_camera(sides: Virt
         assert (
             np.nanquantile(np.abs(depth_errors(node)) / np.sqrt(covariances[:, 2, 2]), 0.95) < 3.0
         )
-        # stereo knows least along the ray, which the side camera sees slanted
+        # stereo is least exact along the ray, which is slanted in the virtual view
         rays = node.points_cam / np.linalg.norm(node.points_cam, axis=1, keepdims=True)
         worst = np.linalg.eigh(covariances)[1][:, :, 2]
         assert np.median(np.abs(np.sum(rays * worst, axis=1))) > 0.95
 
 
-def test_side_nodes_are_numbered_and_say_where_they_come_from(sides: VirtualNodes):
+def test_virtual_nodes_are_numbered_and_name_their_source(sides: VirtualNodes):
     topomap = built_corridor()
     assert [node.summary.node_id for node in sides.nodes] == list(range(len(sides.nodes)))
     assert [s.node_id for s in sides.summaries] == list(range(len(sides.nodes)))
@@ -114,7 +114,7 @@ def test_side_nodes_are_numbered_and_say_where_they_come_from(sides: VirtualNode
     assert 2 < len(sides.nodes) < len(topomap.nodes)
 
 
-def test_each_is_ranked_first_by_its_own_looks_and_its_centre_is_where_it_looks(
+def test_each_is_ranked_first_for_its_own_features_and_has_its_centre_on_the_wall(
     sides: VirtualNodes,
 ):
     (model,) = sides.coarse_models.values()
@@ -142,7 +142,7 @@ def test_limits_on_points_are_kept():
     assert described(view, min_points=5001, max_points=5001) == []
 
 
-def test_pictures_that_show_no_walls_have_no_sides():
+def test_images_without_walls_have_no_virtual_views():
     view = prepare_frame(WalkAhead(0)[4])
     blank = np.full_like(view.grey, 90)
     assert described(replace(view, grey=blank, right_grey=blank)) == []
@@ -165,7 +165,7 @@ def test_without_spacing_a_map_has_none(tiny_recording: Path):
     steps=st.lists(st.tuples(st.floats(0.0, 0.7), st.floats(-0.07, 0.07)), min_size=1, max_size=30),
     spacing=st.floats(1.0, 5.0),
 )
-def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
+def test_selected_nodes_are_near_each_node_and_far_from_each_other(
     steps: list[tuple[float, float]], spacing: float
 ):
     """The distance is Eq. 1 with a larger threshold and half the weight of rotations."""
@@ -183,7 +183,7 @@ def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
             assert np.delete(distances, chosen.index(k)).min(initial=np.inf) > spacing * 0.3
 
 
-def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
+def test_a_path_mapped_in_both_directions_needs_no_virtual_views():
     there = [Rigid3(np.eye(3), np.array([0.0, 0.0, 0.3 * k])) for k in range(80)]
     back_again = [
         Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.array([0.5, 0.0, 0.3 * k]))
@@ -193,11 +193,11 @@ def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
         select_virtual_view_nodes(poses, spaced(3.0)) for poses in (there, there + back_again)
     )
     assert both < alone
-    assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond where anybody came back
+    assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond the part mapped in reverse direction
     assert {k for k in alone if k > 39 + 10} == {k for k in both if k > 39 + 10}
 
 
-def test_a_narrow_lens_makes_a_map_without_sides():
+def test_a_narrow_camera_makes_a_map_without_virtual_views():
     narrow = Camera.pinhole(320, 240, 600.0, 600.0, 159.5, 119.5)
     topomap = build_node_map(replace(WalkAhead(0), num_pairs=2, camera=narrow))
     assert topomap.sides is None

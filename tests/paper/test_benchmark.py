@@ -100,7 +100,7 @@ def test_a_part_makes_its_own_tables_alone(room: Path, capsys: pytest.CaptureFix
     assert not (room / "report.html").exists()
 
 
-def test_without_recordings_there_is_nothing_to_ask(
+def test_without_recordings_there_are_no_queries(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out = str(tmp_path / "out")

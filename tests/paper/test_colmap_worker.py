@@ -11,7 +11,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
-def test_mutual_neighbours_are_found_whatever_their_order():
+def test_mutual_neighbours_are_found_in_any_order():
     rng = np.random.default_rng(0)
     train = _unit(rng.normal(size=(60, 128)))
     order = rng.permutation(60)[:40]

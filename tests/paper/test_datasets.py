@@ -62,7 +62,7 @@ def test_a_recording_is_complete_with_its_last_picture_and_of_one_quality(tmp_pa
     assert not is_complete(replace(TINY, take=2), layout.folder, draft=True)
 
 
-def test_what_is_at_hand_is_kept_and_the_rest_is_named(
+def test_complete_datasets_are_kept_and_missing_recordings_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     there = {"lab_map", "lab_night", "corridor_day"}
@@ -80,7 +80,7 @@ def test_the_quick_lab_can_be_opened_anywhere():
     assert all(pose is not None for label in lab.queries for pose in lab.open_queries(label).poses)
 
 
-def test_real_recordings_are_those_that_are_there(shared: Path, tmp_path: Path):
+def test_real_recordings_are_the_existing_ones(shared: Path, tmp_path: Path):
     assert real_datasets(tmp_path) == []
     found = real_datasets(shared / "data")
     assert [dataset.name for dataset in found] == ["kitchen", "zed-lab", "kitti-1", "kitti-2"]

@@ -22,7 +22,7 @@ def _sample(image: np.ndarray, y: float, x: float) -> np.ndarray:
     return value
 
 
-def test_a_deformable_convolution_samples_where_its_offsets_lead():
+def test_a_deformable_convolution_samples_at_its_offsets():
     torch = pytest.importorskip("torch", reason="torch is not installed")
     rng = np.random.default_rng(0)
     image, weight = rng.normal(size=(3, 6, 7)), rng.normal(size=(4, 3, 3, 3))

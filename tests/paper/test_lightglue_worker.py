@@ -74,7 +74,7 @@ def test_the_worker_triangulates_and_finds_the_pose(tmp_path: Path):
         assert np.allclose(found.translation, poses[4].translation, atol=1e-3)
         assert np.allclose(found.rotation, poses[4].rotation, atol=1e-3)
         assert answer["ms"] > 0
-    # 5 images; 6 pairs of the map and 2 of the query
+    # 5 images, 6 pairs of the map and 2 of the query
     assert len(list(tmp_path.glob("*.npz"))) == 5 + 6 + 2
 
 

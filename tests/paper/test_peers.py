@@ -31,7 +31,7 @@ def _blank() -> StereoFrame:
     return StereoFrame("blank", 0, np.full((CAMERA.height, CAMERA.width), 128, np.uint8), CAMERA)
 
 
-def test_the_papers_step_finds_the_room_and_says_nothing_of_a_blank_picture(
+def test_the_papers_step_finds_the_room_and_refuses_a_blank_image(
     tiny_recording: Path, frames: list[StereoFrame]
 ):
     peer = PaperStep(built_room(tiny_recording), [open_sequence(tiny_recording)])
@@ -44,7 +44,7 @@ def test_the_papers_step_finds_the_room_and_says_nothing_of_a_blank_picture(
     assert peer.feature_name in ("OpenCV SURF", "OpenCV SIFT")
 
 
-def test_retrieval_gives_a_nodes_pose_whatever_it_sees(
+def test_retrieval_gives_a_nodes_pose_for_any_image(
     tiny_recording: Path, frames: list[StereoFrame]
 ):
     topomap = built_room(tiny_recording)
@@ -68,7 +68,7 @@ def test_pycolmap_finds_the_room(tiny_recording: Path, frames: list[StereoFrame]
     assert list(tmp_path.iterdir()) == []
 
 
-def test_opencvs_default_pnp_solves_what_can_be_solved():
+def test_opencvs_default_pnp_solves_valid_matches():
     rng = np.random.default_rng(1)
     cam_from_world = Rigid3(exp_so3(np.array([0.1, -0.2, 0.05])), np.array([0.2, -0.1, 0.3]))
     points = rng.uniform([-2.0, -1.0, 3.0], [2.0, 1.0, 6.0], (40, 3))
@@ -79,7 +79,7 @@ def test_opencvs_default_pnp_solves_what_can_be_solved():
     assert solved(points[:3], pixels[:3], CAMERA) is None
 
 
-def test_far_poses_and_poses_for_strangers_are_counted():
+def test_far_poses_and_poses_of_out_of_map_images_are_counted():
     truth, far = Rigid3.identity(), Rigid3(np.eye(3), np.array([0.6, 0.0, 0.0]))
     here = StereoFrame("a", 0, np.zeros((2, 2), np.uint8), CAMERA, world_from_cam=truth)
     stranger = StereoFrame("b", 0, np.zeros((2, 2), np.uint8), CAMERA)
@@ -98,7 +98,7 @@ def test_far_poses_and_poses_for_strangers_are_counted():
     assert found["median_translation_m"] == pytest.approx(0.3)
 
 
-def test_installed_size_counts_what_is_needed():
+def test_installed_size_counts_dependencies():
     numpy_alone = installed_bytes(["numpy"])
     assert numpy_alone is not None
     assert numpy_alone > 10_000_000

@@ -30,7 +30,7 @@ FOUND, TRUTH = (
 )
 
 
-def test_the_losses_vanish_at_the_truth_and_know_that_q_is_minus_q():
+def test_the_losses_vanish_at_the_truth_and_treat_q_as_minus_q():
     points = torch.tensor([[[0.5, 0.2, 4.0], [-0.3, 0.1, 3.0]]], dtype=torch.float64)
     truth = as_tensors(TRUTH)
     for translation, quaternion in (truth, (truth[0], -truth[1])):
@@ -103,7 +103,7 @@ def test_it_learns_the_room_and_is_saved(loss: str, tiny_recording: Path, tmp_pa
     np.testing.assert_allclose(again.matrix(), posenet.localize([image])[0].matrix(), atol=1e-6)
 
 
-def test_a_file_that_is_no_posenet_is_told(tmp_path: Path):
+def test_a_file_without_posenet_is_an_error(tmp_path: Path):
     torch.save({"config": {}}, tmp_path / "other.pth")
     with pytest.raises(WeightsError, match=r"other\.pth is no PoseNet"):
         PoseNet.load(tmp_path / "other.pth")

@@ -105,9 +105,7 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc_paper/pose_losses.py", {"learning PoseNet"}),
     ],
 )
-def test_a_change_has_those_stages_done_again_that_run_it(
-    module: str, stages: set[str], code: Path
-):
+def test_stages_that_run_changed_code_are_done_again(module: str, stages: set[str], code: Path):
     path = code / module
     assert _done_again(lambda: path.write_text(path.read_text() + "\nCHANGED = 1\n")) == stages
 
@@ -123,7 +121,7 @@ def test_comments_and_docstrings_are_no_change(code: Path):
     assert _done_again(lambda: path.write_text(reworded)) == set()
 
 
-def test_what_a_stage_comes_to_import_counts(code: Path):
+def test_a_new_import_of_a_stage_counts(code: Path):
     path = code / "topoloc/retrieval/vlad.py"
     before = MAPPING.files()
     path.write_text(

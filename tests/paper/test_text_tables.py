@@ -42,7 +42,7 @@ def _row(method: str = "surf-vlad", nodes: str = "D_thresh 2 m", **more: Any) ->
     return row | errors | {"topological_accuracy": 0.9, "neighbour_accuracy": 1.0} | more
 
 
-def test_the_journal_holds_what_the_stored_results_give():
+def test_the_journal_matches_the_stored_results():
     page = (ROOT / "docs" / "journal" / "paper.md").read_text(encoding="utf-8")
     assert block_of(json.loads(STORED.read_text(encoding="utf-8"))) in page
 
@@ -53,7 +53,7 @@ def test_stored_results_name_the_weights_of_every_row():
     assert markdown_of(results).count("\n| ") > len(results["accuracy"])
 
 
-def test_a_row_says_how_many_queries_it_is_the_median_of_and_what_was_not_run():
+def test_a_row_has_its_number_of_queries_and_the_skipped_runs():
     text = accuracy_table(
         [
             _row(),
@@ -67,11 +67,11 @@ def test_a_row_says_how_many_queries_it_is_the_median_of_and_what_was_not_run():
     assert "none of 20 localized" in text
 
 
-def test_html_escapes_what_it_shows():
+def test_html_is_escaped():
     assert "<script>" not in accuracy_table([_row(weights="<script>")]).html()
 
 
-def test_the_gain_of_normalisation_is_the_share_of_the_error_that_is_gone():
+def test_the_gain_of_normalisation_is_the_removed_share_of_the_error():
     rows = [
         _row(normalization=kind, median_translation_m=metres)
         for kind, metres in (("none", 0.02), ("paper", 0.015), ("wide", 0.01))

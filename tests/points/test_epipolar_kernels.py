@@ -85,7 +85,7 @@ PLANES = [
 
 
 @pytest.mark.parametrize("plane", PLANES)
-def test_disparity_is_unbiased_and_as_precise_as_it_says(plane: tuple[float, float, float]):
+def test_disparity_is_unbiased_and_as_precise_as_its_sigma(plane: tuple[float, float, float]):
     left, right = rendered_pair(*plane, noise=2.0, seed=3)
     points = random_points(1500)
     disparities, sigmas = matched(left, right, points)
@@ -98,8 +98,8 @@ def test_disparity_is_unbiased_and_as_precise_as_it_says(plane: tuple[float, flo
     in_sigmas = 1.4826 * np.median(np.abs(errors / sigmas[found]))
     if plane[1:] == (0.0, 0.0):
         assert 0.5 < in_sigmas < 2.0
-    # a slanted window fits no other one exactly, which its own residuals show in part only: this is
-    # what the floor is for
+    # no window matches a slanted one exactly, and its residuals show this only in part: hence the
+    # floor
     else:
         assert 1.4826 * np.median(np.abs(errors / np.hypot(sigmas[found], 0.12))) < 1.0
 
@@ -110,7 +110,7 @@ def test_no_fraction_of_a_pixel_is_preferred():
     errors = []
     for fraction in np.arange(0.0, 1.0, 0.125):
         points = random_points(400, 1)
-        points[:, 0] = np.rint(points[:, 0])  # whole pixels, where the effect is worst
+        points[:, 0] = np.rint(points[:, 0])  # whole pixels, for the largest effect
         disparities, _ = matched(
             *rendered_pair(15.0 + fraction, 0.0, 0.0, noise=1.0, seed=5), points
         )

@@ -49,7 +49,7 @@ def depth_errors_in_sigmas(located: MetricPoints, truth: np.ndarray) -> np.ndarr
     return (located.points_cam[rows, 2] - truth[rows]) / np.sqrt(located.covariances[rows, 2, 2])
 
 
-def test_stereo_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, np.ndarray]):
+def test_stereo_points_lie_at_their_pixels(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
     located = locate_points(features, view)
@@ -61,7 +61,7 @@ def test_stereo_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, n
     np.testing.assert_allclose(reprojected, features.points_img[located.valid], atol=1e-3)
 
 
-def test_depth_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, np.ndarray]):
+def test_depth_points_lie_at_their_pixels(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
     located = locate_points(features, depth_view(view, depth))
@@ -133,7 +133,7 @@ def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[PreparedFram
     assert located.points_cam[0, 2] == pytest.approx(2.0)
 
 
-def test_coarse_depth_is_exact_on_planes_and_uncertain_where_edges_are_smeared(
+def test_coarse_depth_is_exact_on_planes_and_uncertain_at_smeared_edges(
     room_view: tuple[PreparedFrame, np.ndarray],
 ):
     camera = room_view[0].camera

@@ -65,7 +65,7 @@ def _located(
     return triangulate_from_motion(own, sigmas, LENS, others, pose_sigma_px=0.0)
 
 
-def test_errors_are_as_large_as_the_covariances_say():
+def test_errors_match_the_covariances():
     points, descriptors = _made()
     located = _located(points, descriptors)
     assert located.valid.mean() > 0.95
@@ -77,12 +77,12 @@ def test_errors_are_as_large_as_the_covariances_say():
     assert np.quantile(np.abs(errors[:, 2]) / points[located.valid, 2], 0.5) < 0.01
 
 
-def test_mismatches_are_not_believed():
+def test_mismatches_are_rejected():
     points, descriptors = _made()
     rng = np.random.default_rng(3)
     wrong = rng.random(len(points)) < 0.3
     order = []
-    for _ in POSES:  # each picture is wrong about these points in another way
+    for _ in POSES:  # these points have other mismatches in each image
         rows = np.arange(len(points))
         rows[wrong] = rng.permutation(rows[wrong])
         order.append(rows)

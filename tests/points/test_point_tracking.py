@@ -51,9 +51,7 @@ def test_points_are_followed_across_a_shift(picture: np.ndarray):
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.6, 30.0)])
-def test_alignment_takes_drift_away_whatever_the_light(
-    picture: np.ndarray, gain: float, offset: float
-):
+def test_alignment_removes_drift_in_any_light(picture: np.ndarray, gain: float, offset: float):
     corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
     rng = np.random.default_rng(0)
     start = (corners + SHIFT + rng.uniform(-0.8, 0.8, corners.shape)).astype(np.float32)
@@ -97,7 +95,7 @@ def test_a_point_that_became_something_else_is_let_go(picture: np.ndarray):
     assert found.is_matched.mean() < 0.25
 
 
-def test_what_is_uncertain_is_off_by_more(picture: np.ndarray):
+def test_uncertain_points_have_larger_errors(picture: np.ndarray):
     corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
     levels = np.linspace(1, 16, picture.shape[1])  # ever more noise from left to right
     noisy = (

@@ -80,7 +80,7 @@ def begun(path: Path, by: str = "atomic_write") -> tuple[subprocess.Popen[str], 
     return child, path.parent / child.stdout.readline().strip()
 
 
-def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_not(tmp_path: Path):
+def test_files_of_killed_writers_are_removed_and_files_of_living_ones_stay(tmp_path: Path):
     path = tmp_path / "map.topo"
     (killed, left), (living, held) = begun(path), begun(path)
     left.with_name(left.name + "-journal").write_bytes(b"of SQLite")
@@ -109,7 +109,7 @@ def test_a_scratch_file_is_its_own_while_it_is_used(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_all_that_nobody_writes_any_more_is_removed_from_a_folder(tmp_path: Path):
+def test_abandoned_files_are_removed_from_a_folder(tmp_path: Path):
     (tmp_path / ".a.topo.0123456789abcdef.part").write_bytes(b"")
     kept = [tmp_path / ".hidden", tmp_path / "b.part"]
     for path in kept:
@@ -127,7 +127,7 @@ def test_leftovers_of_older_versions_go_too(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_tried_out_beside_a_file_goes_also_when_its_process_was_killed(tmp_path: Path):
+def test_temporary_files_of_killed_processes_are_removed(tmp_path: Path):
     path = tmp_path / "map.topo"
     write_bytes(path, b"old")
     with temporary_file(path) as scratch:

@@ -178,7 +178,7 @@ def test_a_frame_without_both_images_keeps_the_times_of_others(recording: Path):
     ]
 
 
-def test_what_is_missing_cannot_be_guessed(recording: Path):
+def test_missing_images_at_the_ends_are_ambiguous(recording: Path):
     """If names begin at 1, the first or the last image may be missing."""
     for folder in ("image_0", "image_1"):
         (recording / folder / "000000.png").unlink()

@@ -71,7 +71,7 @@ def test_millimetres_are_taken_by_the_sensors_resolution(
         UNIT: (SHORT, unit, 1),
         WIDTH: (LONG, 1280, 1),
     }
-    # 5 mm at 100 pixels a millimetre, and the picture is half as wide as it was taken
+    # 5 mm at 100 pixels per millimetre, and the image has half of its original width
     assert exif_focal_length(
         _jpeg(tmp_path / "a.jpg", _exif("<", tags)), 640, 480
     ) == pytest.approx(250.0)
@@ -100,7 +100,7 @@ def test_millimetres_are_taken_by_the_sensors_resolution(
         "no order",
     ],
 )
-def test_data_that_tells_nothing_gives_none(exif: bytes, tmp_path: Path):
+def test_data_without_a_focal_length_gives_none(exif: bytes, tmp_path: Path):
     assert exif_focal_length(_jpeg(tmp_path / "a.jpg", exif), 640, 480) is None
 
 

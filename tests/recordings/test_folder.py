@@ -72,7 +72,7 @@ def test_rgbd(plain: Plain, colour: str):
 @pytest.mark.parametrize(
     ("names", "key"), [(("left", "right"), "baseline"), (("rgb", "depth"), "depth_factor")]
 )
-def test_what_camera_json_must_say(plain: Plain, names: tuple[str, str], key: str):
+def test_required_keys_of_camera_json(plain: Plain, names: tuple[str, str], key: str):
     with pytest.raises(CalibrationError, match=r"camera\.json.*" + key):
         open_sequence(plain(*names))
     with pytest.raises(CalibrationError, match=r"camera\.json.*" + key):

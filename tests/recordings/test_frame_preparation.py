@@ -27,7 +27,7 @@ def test_a_rectified_pair_is_taken_as_it_is(tiny_recording: Path):
     assert prepare_frame(frame, with_depth=False).right_grey is None
 
 
-def test_a_turned_pair_is_rectified_and_says_how_it_turned():
+def test_a_rotated_pair_is_rectified_and_returns_its_rotation():
     panels, world_from_left = tiny_world.room(), tiny_world.path_pose(2)
     right_from_left = Rigid3(
         exp_so3(np.array([0.01, 0.03, -0.02])), np.array([-0.12, 0.004, 0.003])
@@ -55,7 +55,7 @@ def test_a_turned_pair_is_rectified_and_says_how_it_turned():
         assert np.median(np.abs(seen.astype(float) - expected)) < 3.0
 
 
-def test_what_nothing_can_be_measured_in_is_refused(tiny_recording: Path):
+def test_frames_without_depth_or_calibration_are_refused(tiny_recording: Path):
     frame = topoloc.open_sequence(tiny_recording)[0]
     with pytest.raises(CalibrationError, match=r"000000\.png: no calibration"):
         prepare_frame(replace(frame, camera=None))
@@ -66,7 +66,7 @@ def test_what_nothing_can_be_measured_in_is_refused(tiny_recording: Path):
 DEPTH_CAMERA = Camera.pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
 
 
-def test_registered_depth_is_what_the_other_camera_would_measure():
+def test_registered_depth_equals_depth_of_the_other_camera():
     panels, world_from_depth = tiny_world.room(), tiny_world.path_pose(1)
     cam_from_depth = Rigid3(
         exp_so3(np.array([0.01, -0.02, 0.005])), np.array([-0.03, 0.002, 0.004])

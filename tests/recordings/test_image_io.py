@@ -94,7 +94,7 @@ def test_exif_orientation_is_obeyed(tmp_path: Path):
     )
 
 
-def test_heic_is_read_where_its_decoder_is(tmp_path: Path):
+def test_heic_is_read_with_its_decoder(tmp_path: Path):
     pytest.importorskip("pi_heif", reason="the extra heic is not installed")
     y, x = np.mgrid[:48, :64]
     path = Path(__file__).parent / "pictures" / "ramp.heic"
@@ -171,7 +171,7 @@ def test_one_wrong_byte_in_a_png_is_found(tmp_path: Path):
         b"II*\0" + b"q" * 99,
     ],
 )
-def test_what_is_no_picture_is_refused(tmp_path: Path, data: bytes):
+def test_invalid_images_are_refused(tmp_path: Path, data: bytes):
     (tmp_path / "a.png").write_bytes(data)
     with pytest.raises(UnreadableImageError, match=r"a\.png"):
         read_image(tmp_path / "a.png")

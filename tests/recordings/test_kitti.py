@@ -28,7 +28,7 @@ def test_frames(kitti: Path):
         sequence[3]
 
 
-def test_colour_pair_where_there_is_no_grey_one(kitti: Path):
+def test_colour_pair_without_a_grey_one(kitti: Path):
     for old, new in (("image_0", "image_2"), ("image_1", "image_3")):
         (kitti / old).rename(kitti / new)
     frame = open_kitti(kitti)[0]
@@ -37,7 +37,7 @@ def test_colour_pair_where_there_is_no_grey_one(kitti: Path):
     # P2 and P3 are K [I | t] with t_x = 3 / 60 and -27 / 60.
     assert frame.rig.baseline == pytest.approx(0.5)
     assert frame.rig.is_rectified
-    # The rows are the poses of camera 0; t is the translation of cam2_from_cam0.
+    # The rows are the poses of camera 0, and t is the translation of cam2_from_cam0.
     cam2_from_cam0 = Rigid3(np.eye(3), np.array([0.05, 0.0, 0.0]))
     assert_same_pose(frame.world_from_cam @ cam2_from_cam0, pose(0))
 
@@ -129,7 +129,7 @@ def test_bad_times(kitti: Path, times: str, says: str):
 
 
 @pytest.mark.parametrize("name", ["times.txt", "calib.txt"])
-def test_what_is_no_text(kitti: Path, name: str):
+def test_binary_files_are_refused(kitti: Path, name: str):
     (kitti / name).write_bytes(b"\xff\xfe\x00\x81" * 9)
     with pytest.raises(RecordingError, match=name):
         open_kitti(kitti)

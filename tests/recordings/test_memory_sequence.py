@@ -135,7 +135,7 @@ def depth_of(array: Any) -> topoloc.DepthImage:
         (lambda: "a path", "a StereoFrame is expected, not str"),
     ],
 )
-def test_what_is_refused(frame: Callable[[], Any], says: str):
+def test_invalid_frames_are_refused(frame: Callable[[], Any], says: str):
     with pytest.raises(RecordingError, match=f"memory, frame 1.*{says}") as raised:
         topoloc.MemorySequence(
             one for one in (changed(rgbd(0), t_ns=-1), frame())
@@ -152,7 +152,7 @@ def test_what_is_refused(frame: Callable[[], Any], says: str):
         ([5, 4, 100_000_000], "t_ns 4 is not after the one before, 5"),
     ],
 )
-def test_times_that_are_none(times: list[int], says: str):
+def test_invalid_times_are_refused(times: list[int], says: str):
     with pytest.raises(RecordingError, match=f"memory: {says}"):
         topoloc.MemorySequence(
             [changed(stereo(index), t_ns=t_ns) for index, t_ns in enumerate(times)]

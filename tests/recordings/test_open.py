@@ -54,7 +54,7 @@ def test_opening_reads_no_picture(kitti: Path, euroc: Path, tum: Path, seven_sce
         ("left", "; nearest is folder: pictures, or left/ and right/"),
     ],
 )
-def test_unknown_folders_name_what_they_hold_and_the_nearest_format(
+def test_errors_of_unknown_folders_name_their_content_and_the_nearest_format(
     held: str, nearest: str, tmp_path: Path
 ):
     (tmp_path / held).write_text("nothing")

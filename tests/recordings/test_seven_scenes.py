@@ -47,7 +47,7 @@ def test_frames_without_a_pose_or_all_without_depth(seven_scenes: Path):
     assert sequence[0].depth is None
 
 
-def test_several_runs_must_be_told_apart(seven_scenes: Path):
+def test_one_of_several_runs_must_be_selected(seven_scenes: Path):
     (seven_scenes / "seq-02").mkdir()
     assert len(open_seven_scenes(seven_scenes)) == 2
     (seven_scenes / "seq-02" / "frame-000000.color.png").touch()

@@ -36,7 +36,7 @@ def test_tum_times_are_exact(tmp_path: Path):
     assert_same_pose(trajectory.world_from_cam[1], pose(1))
 
 
-def test_nanoseconds_are_told_by_their_size(tmp_path: Path):
+def test_nanoseconds_are_recognised_by_their_size(tmp_path: Path):
     path = tmp_path / "a.tum"
     path.write_text(
         f"{tum_line('1403715273262142976.000000', pose(0))}\n{tum_line('1403715273312143104', pose(1))}\n"  # noqa: E501
@@ -57,7 +57,7 @@ def test_kitti_rows(tmp_path: Path):
     st.lists(st.integers(-5 * SECOND, 2_000_000_000 * SECOND), min_size=1, max_size=5, unique=True),
     st.integers(0, 1000),
 )
-def test_what_is_written_is_read_again(
+def test_a_written_trajectory_is_read_again(
     tmp_path_factory: pytest.TempPathFactory, times: list[int], seed: int
 ):
     folder = tmp_path_factory.mktemp("trip")
@@ -202,7 +202,7 @@ def test_rotations_of_kitti_rows_are_made_exact(tmp_path: Path, turned: float):
     np.testing.assert_allclose(rotation, pose(1).rotation, atol=2e-3)
 
 
-def test_clocks_that_differ_are_said_and_mended(tmp_path: Path):
+def test_a_clock_offset_is_reported_and_corrected(tmp_path: Path):
     poses = [Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(20)]
     frames = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(20)]
     late, in_microseconds = tmp_path / "late.tum", tmp_path / "microseconds.tum"
@@ -225,7 +225,7 @@ def test_clocks_that_differ_are_said_and_mended(tmp_path: Path):
         )
 
 
-def test_own_poses_are_read_as_told():
+def test_own_poses_are_read_in_the_given_convention():
     poses = [Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(20)]
     sequence = SequenceView(
         recording_of([100_000_000 * k for k in range(20)]), list(range(20)), list(poses)

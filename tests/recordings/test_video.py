@@ -58,7 +58,7 @@ def test_frames_come_in_order_with_the_times_of_the_container(
         assert frame.name == sequence.names[number] == f"{number:06d}"
 
 
-def test_frames_may_be_asked_for_in_any_order_and_chosen(film: Path):
+def test_frames_may_be_read_in_any_order_and_selected(film: Path):
     sequence = open_sequence(film)
     for number in (7, 2, 2, 11, 0, -1):
         assert abs(float(sequence[number].image.mean()) - 20 * (number % NUM_FRAMES)) < 6
@@ -92,7 +92,7 @@ def test_a_camera_of_another_size_is_refused(film: Path):
 @pytest.mark.parametrize(
     "content", [b"", b"no video at all", b"\x00\x00\x00\x18ftypmp42" + bytes(200)]
 )
-def test_what_is_no_video_is_one_line(
+def test_other_files_are_one_line(
     tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]
 ):
     path = tmp_path / "broken.mp4"

@@ -62,7 +62,7 @@ def test_feature_maps_of_a_224_picture_are_as_large_as_published(name: BackboneN
     assert tuple(maps.shape) == (1, 512, side, side)
 
 
-def test_a_shallower_backbone_gives_what_the_whole_one_has_on_its_way():
+def test_a_shallower_backbone_gives_an_intermediate_map_of_the_whole_one():
     torch.manual_seed(0)
     whole = Backbone("squeezenet1_1", num_outputs=None).eval()
     part = Backbone("squeezenet1_1", num_outputs=None, depth=5).eval()

@@ -55,7 +55,7 @@ def alike_by_vlad(cells: np.ndarray | None, count: int = 40) -> tuple[SurfVlad, 
 
 
 @pytest.mark.parametrize("shift", [-1, 0, 1])
-def test_a_place_is_known_from_beside_the_way(shift: int):
+def test_a_place_is_recognised_from_beside_the_path(shift: int):
     wide = places(40, columns=COLUMNS + 2)
     mapped, asked = wide[:, :, 1:-1], wide[:, :, 1 + shift : 1 + shift + COLUMNS]
     noise = 0.7 * np.random.default_rng(1).normal(size=asked.shape).astype(np.float32)
@@ -90,7 +90,7 @@ def test_a_picture_is_wholly_like_itself():
     assert found.argmax() == 3
 
 
-def test_where_vlad_cannot_tell_the_cells_do():
+def test_cells_distinguish_places_with_equal_vlad():
     cells = places(40)
     with_cells, features = alike_by_vlad(cells)
     asked = cells + 0.5 * places(40, seed=9)
@@ -134,7 +134,7 @@ def test_the_stored_model_ranks_alike():
         )
 
 
-def test_nodes_that_are_no_more_are_not_named():
+def test_removed_nodes_are_not_ranked():
     cells = places(6)
     localizer, features = alike_by_vlad(cells, 6)
     left = open_coarse_localizer(node_ids_to_rows(localizer.to_model(), [0, 2, 5]))
@@ -156,7 +156,7 @@ def test_one_picture_and_pictures_all_alike(cells: np.ndarray):
     np.testing.assert_allclose(found, np.full(len(cells), 1.0 if cells.any() else 0.0), atol=0.01)
 
 
-def test_cells_of_another_form_are_told():
+def test_cells_of_another_shape_are_an_error():
     localizer, features = alike_by_vlad(places(3), 3)
     with pytest.raises(MapError, match="not of the form"):
         localizer.rank(NO_IMAGE, replace(features, cells=places(1)[0, :, :5]), 1)
@@ -174,7 +174,7 @@ def test_cells_of_another_form_are_told():
         ("cell_vectors", lambda array: array.astype(np.float32)),
     ],
 )
-def test_a_damaged_model_is_told(name: str, change):
+def test_a_damaged_model_is_an_error(name: str, change):
     model = alike_by_vlad(places(4), 4)[0].to_model()
     with pytest.raises(MapError, match="damaged"):
         open_coarse_localizer(
@@ -182,7 +182,7 @@ def test_a_damaged_model_is_told(name: str, change):
         )
 
 
-def test_a_real_walk_by_day_is_known_by_night(shared: Path):
+def test_a_real_walk_by_day_is_recognised_by_night(shared: Path):
     """Frames of equal numbers show the same place within two frames. The walk by day may be beside
     the walk by night."""
     walks = shared / "data" / "gardenspoint"

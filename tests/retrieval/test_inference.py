@@ -38,7 +38,7 @@ def test_several_threads_get_the_bytes_of_one(monkeypatch: pytest.MonkeyPatch):
     assert torch.get_num_threads() == before
 
 
-def test_the_number_of_threads_comes_back_whoever_leaves_last():
+def test_the_number_of_threads_is_restored_in_any_order():
     own = torch.get_num_threads()
     entered, left = threading.Event(), threading.Event()
 

@@ -19,14 +19,14 @@ def _files() -> list[str]:
     )
 
 
-def test_they_are_small_and_of_known_kinds():
+def test_they_are_small_and_of_known_feature_types():
     assert _files() == ["surf.npz", "topoloc-net.npz"]
     folder = resources.files("topoloc.retrieval").joinpath("vocabularies")
     assert sum(len(folder.joinpath(name).read_bytes()) for name in _files()) <= 1_500_000
 
 
 @pytest.mark.parametrize("kind", ["surf", "topoloc-net"])
-def test_they_say_what_they_were_learned_of(kind: str):
+def test_they_name_their_training_data(kind: str):
     vocabulary = shared_vocabulary(kind)
     assert vocabulary is not None
     about = vocabulary.about
@@ -37,7 +37,7 @@ def test_they_say_what_they_were_learned_of(kind: str):
     assert len(vocabulary.version) == 12
 
 
-def test_other_kinds_have_none():
+def test_other_feature_types_have_none():
     assert shared_vocabulary("sift") is None
 
 

@@ -161,7 +161,7 @@ def test_the_same_things_elsewhere_in_the_picture_are_another_place(weight: floa
     assert num_right == 12 if weight > 0.0 else num_right < 6
 
 
-def test_places_count_from_border_to_border_whatever_the_size():
+def test_positions_are_relative_to_the_image_size():
     features = things(np.arange(60))
     small = append_positions(features, 200, 100, VladConfig(position_weight=0.5))
     assert small.shape == (60, 66)

@@ -58,7 +58,7 @@ def test_eight_frames_lost_are_bridged_although_another_panel_is_nearer():
     assert np.abs(along_the_wall(walked, result)).max() < 0.1
 
 
-def test_what_the_motion_cannot_decide_is_a_submap_of_its_own():
+def test_an_ambiguous_motion_begins_another_submap():
     """The camera is half a panel further than predicted, so that two panels are equally likely.
     SLAM selects neither."""
     walked = walk_along(*kept(20, jump=0.5 * PERIOD))
@@ -70,7 +70,7 @@ def test_what_the_motion_cannot_decide_is_a_submap_of_its_own():
     assert np.isnan(errors[10:]).all()
 
 
-def test_a_submap_is_joined_by_what_is_unique_and_by_no_panel():
+def test_a_submap_is_joined_by_unique_objects_and_not_by_panels():
     """The camera goes there and back. The gap is too long for prediction, and a board before it is
     seen again on return."""
     there, times = kept(24, jump=0.5)
@@ -107,9 +107,7 @@ THERE_AND_BACK = 0.3 * np.concatenate([np.arange(10), np.arange(9)[::-1]])
     [(0.6 * np.arange(12), ()), (STOPS, (0.5, 1.0, 2.5)), (THERE_AND_BACK, ())],
     ids=["begins fast", "stops", "turns back"],
 )
-def test_between_two_steps_that_look_the_same_the_submap_ends(
-    places: np.ndarray, boards: tuple[float, ...]
-):
+def test_a_submap_ends_at_an_ambiguous_step(places: np.ndarray, boards: tuple[float, ...]):
     """No frame is lost. A step of more than half a panel looks like a shorter one back. Each of
     these walks once had an unreported error of a whole panel."""
     walked = walk_along(places.tolist(), (0.1 * np.arange(len(places))).tolist(), boards)
@@ -118,7 +116,7 @@ def test_between_two_steps_that_look_the_same_the_submap_ends(
     assert worst_step(walked, result) < 0.1
 
 
-def test_where_boards_are_in_view_an_uneven_walk_is_followed():
+def test_an_uneven_walk_is_tracked_with_boards_in_view():
     """Motion prediction cannot distinguish the steps, most of which are 0.2 to 0.7 m.
     The images can."""
     steps = 0.45 * (1.0 + 0.4 * np.random.default_rng(5).standard_normal(24))
@@ -141,7 +139,7 @@ def test_panels_between_boards_join_nothing(step: float, num_gone: int):
     assert worst_step(walked, result) < 0.1
 
 
-def test_who_turns_back_before_the_wall_is_not_taken_for_lost():
+def test_a_camera_that_turns_back_is_not_lost():
     there = list(np.arange(0.0, 2.0, STEP))
     walked = walk_along([*there, *there[::-1]], list(0.1 * np.arange(2 * len(there))))
     result = run_slam(walked)
@@ -149,7 +147,7 @@ def test_who_turns_back_before_the_wall_is_not_taken_for_lost():
     assert np.abs(along_the_wall(walked, result)).max() < 0.05
 
 
-def test_where_boards_hang_on_the_panels_a_jump_is_followed():
+def test_a_jump_is_tracked_with_boards_on_the_panels():
     """Unique boards make motion prediction unnecessary, although the wall between them repeats."""
     walked = walk_along(*kept(18, jump=0.5), boards=tuple(np.arange(-2.0, 5.0, 0.65)))
     result = run_slam(walked)
@@ -159,7 +157,7 @@ def test_where_boards_hang_on_the_panels_a_jump_is_followed():
 
 @pytest.mark.parametrize("is_stereo", [True, False])
 @pytest.mark.parametrize("step", [0.06, 0.12])
-def test_equal_panels_accuse_no_poses(step: float, is_stereo: bool):
+def test_equal_panels_do_not_refuse_right_poses(step: float, is_stereo: bool):
     """A step to the next panel matches the images as well as the right step, or better."""
     walked = walk_along([step * k for k in range(40)], [0.1 * k for k in range(40)])
     alone = [replace(frame, right=None, rig=None) for frame in walked.frames]

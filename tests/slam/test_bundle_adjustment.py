@@ -63,7 +63,7 @@ def test_wrong_poses_and_points_are_put_right_and_the_first_stays():
     assert np.median(np.linalg.norm(landmarks.positions[: len(points)] - points, axis=1)) < 0.05
 
 
-def test_held_keyframes_do_not_move():
+def test_fixed_keyframes_do_not_move():
     keyframes, landmarks, poses, _ = world()
     keyframes[0].cam_from_world, keyframes[1].cam_from_world = poses[0], poses[1]
     held = [keyframe.cam_from_world for keyframe in keyframes[:2]]
@@ -166,7 +166,7 @@ def test_a_walk_of_many_key_frames_is_adjusted_whole():
     assert pose_errors(keyframes, poses).max() < 0.5 * before.max()
 
 
-def test_anchors_hold_all_poses_and_a_wrong_one_bends_nothing():
+def test_anchors_fix_all_poses_and_a_wrong_one_bends_nothing():
     keyframes, landmarks, poses, _ = world(8)
     shift = Rigid3.exp(np.array([0.3, -0.2, 0.1, 0.05, 0.02, -0.04]))
     there = [pose @ shift for pose in poses]
@@ -176,7 +176,7 @@ def test_anchors_hold_all_poses_and_a_wrong_one_bends_nothing():
     assert pose_errors(keyframes, there).max() < 0.005
 
 
-def test_what_a_long_walk_remembers_is_kept_small():
+def test_observations_and_landmarks_take_little_memory():
     keyframes, landmarks, _, points = world(2)
     seen = keyframes[0].observations
     seen.append(

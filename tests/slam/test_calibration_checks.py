@@ -46,7 +46,7 @@ def open_recording(path: Path) -> Recording:
 
 
 @pytest.mark.parametrize("factor", [0.85, 1.15])
-def test_obeying_a_message_on_the_baseline_mends_it(factor: float):
+def test_the_remedy_for_a_wrong_baseline_works(factor: float):
     frames = [stereo_frame(place) for place in PLACES]
     check_poses(FrameList(frames))
     wrong = factor * tiny_world.BASELINE
@@ -59,7 +59,7 @@ def test_obeying_a_message_on_the_baseline_mends_it(factor: float):
     check_poses(FrameList([with_rig(one, tiny_world.CAMERA, found) for one in frames]))
 
 
-def test_obeying_a_message_on_the_unit_of_poses_mends_it():
+def test_the_remedy_for_a_wrong_unit_of_poses_works():
     sequence = FrameList([stereo_frame(place) for place in PLACES])
     wrong = [Rigid3(one.rotation, 1.15 * one.translation) for one in sequence.poses if one]
     with pytest.raises(TrajectoryError, match=r"depth is 1\d % less") as caught:
@@ -71,7 +71,7 @@ def test_obeying_a_message_on_the_unit_of_poses_mends_it():
 
 
 @pytest.mark.parametrize("factor", [0.85, 1.15])
-def test_obeying_a_message_on_the_focal_length_mends_it(shared: Path, factor: float):
+def test_the_remedy_for_a_wrong_focal_length_works(shared: Path, factor: float):
     right = open_recording(shared / "data" / "zed_lab" / "session2")
     assert right.camera is not None
     with pytest.raises(TrajectoryError, match="a focal length of about") as caught:
@@ -95,7 +95,7 @@ def test_a_street_names_the_focal_length_as_well(shared: Path):
         check_poses(with_focal(street, 1.15))
 
 
-def test_a_disparity_error_of_half_a_pixel_accuses_nobody(shared: Path):
+def test_a_disparity_error_of_half_a_pixel_is_no_fault(shared: Path):
     """Depth in this street is 12 % larger than its poses show: half a pixel of
     disparity at 75 m."""
     check_poses(open_sequence(shared / "data" / "kitti" / "sequences" / "street2@25:51"))
@@ -130,5 +130,5 @@ def test_depth_of_another_view_is_noted(shared: Path):
     assert abs(int(down)) <= 6
 
 
-def test_rendered_depth_is_not_accused():
+def test_rendered_depth_passes():
     assert find_depth_shift(FrameList([depth_frame(place) for place in PLACES[:8]])) is None

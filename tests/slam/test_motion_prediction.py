@@ -54,7 +54,7 @@ def test_an_unsteady_walk_is_trusted_less_and_less_as_time_goes():
     assert six / three == pytest.approx((6 * 7) / (3 * 4), rel=0.05)
 
 
-def test_sigma_covers_what_acceleration_does():
+def test_sigma_covers_acceleration():
     """For walks with random acceleration, compare the error of a prediction over four frames
     with its sigma."""
     rng = np.random.default_rng(0)
@@ -68,7 +68,7 @@ def test_sigma_covers_what_acceleration_does():
     assert np.median(distances) > 0.1, "nor is it boundless"
 
 
-def test_nothing_is_known_before_anything_moved():
+def test_nothing_is_predicted_before_any_motion():
     history = MotionHistory()
     assert history.predict(0) is None
     history.add_pose(0, ahead(0.0))

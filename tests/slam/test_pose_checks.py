@@ -29,7 +29,7 @@ def w_first(pose: Rigid3) -> Rigid3:
     return Rigid3.from_quat_wxyz(np.array([z, w, x, y]), pose.translation)
 
 
-# what poses look like that are of another convention, and what is said of them
+# Poses in other conventions, and words of their error messages.
 WRONG: dict[str, tuple[Callable[[Rigid3], Rigid3], tuple[str, ...]]] = {
     "inverse": (Rigid3.inverse, ("inverse",)),
     "opengl": (lambda pose: Rigid3(pose.rotation @ FLIP, pose.translation), ("opengl",)),
@@ -71,7 +71,7 @@ def steps_of(poses: list[Rigid3], seed: int) -> list[MeasuredStep]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_right_poses_are_believed(seed: int):
+def test_right_poses_pass(seed: int):
     verdict = evaluate_poses(steps_of(POSES, seed), POSES, T_NS)
     assert verdict.is_accepted
     assert verdict.num_informative == len(steps_of(POSES, seed))
@@ -108,7 +108,7 @@ def test_a_single_camera_names_all_but_the_unit(name: str):
     assert verdict.is_accepted == (name == "mm")
 
 
-def test_of_a_single_camera_poses_that_do_not_move_are_not_believed():
+def test_poses_of_a_single_camera_at_rest_are_refused():
     still = [Rigid3(pose.rotation, np.zeros(3)) for pose in POSES]
     assert not evaluate_poses(without_metres(steps_of(POSES, 0)), still, T_NS).is_accepted
 
@@ -138,14 +138,14 @@ def test_poses_of_another_place_are_not_explained():
     assert verdict.conventions == ()
 
 
-def test_positions_beyond_all_places_are_not_believed():
+def test_huge_positions_are_refused():
     far = [Rigid3(pose.rotation, 1e200 * pose.translation) for pose in POSES]
     verdict = evaluate_poses(steps_of(POSES, 0), far, T_NS)
     assert not verdict.is_accepted
     assert verdict.conventions == ()
 
 
-def test_a_camera_that_stands_still_tells_nothing():
+def test_a_camera_at_rest_gives_no_result():
     still = [MeasuredStep(k, k + 1, Rigid3.identity(), 3.0) for k in range(20)]
     assert evaluate_poses(still, [pose.inverse() for pose in POSES], T_NS).is_accepted
 
@@ -177,7 +177,7 @@ class LeftPicturesAlone(SequenceView):
         return replace(super().__getitem__(index), right=None, rig=None)
 
 
-def test_a_recording_of_single_pictures_is_held_against_them_too(tiny_recording: Path):
+def test_a_recording_of_single_images_is_checked_too(tiny_recording: Path):
     sequence = open_sequence(tiny_recording)
     rows = list(range(len(sequence)))
     check_poses(LeftPicturesAlone(sequence, rows, list(sequence.poses)))

@@ -56,7 +56,7 @@ def link(source: int, target: int, ahead: float) -> Link:
         ((0, 2), 17.0, False),
     ],
 )
-def test_a_link_agrees_with_the_way_between(
+def test_a_link_agrees_with_the_path_between(
     submaps: tuple[int, int], metres_gone: float, is_possible: bool, is_reversed: bool
 ):
     keyframes = walked()

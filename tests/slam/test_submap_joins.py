@@ -75,10 +75,10 @@ def looking_at(*recordings: StereoSequence):
     return look
 
 
-def test_what_both_sides_of_a_gap_see_at_their_edges_joins_them_and_no_frame_is_lost(
+def test_weak_pairs_at_both_sides_of_a_gap_join_without_a_lost_frame(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    limit = 120  # no single pair of pictures is believed, except by joins
+    limit = 120  # no single image pair suffices, except for joins
     for module, function in (("odometry", match_places), ("loop_closure", match_keyframes)):
         strict = partial(function, min_inliers=limit)
         monkeypatch.setattr(f"topoloc.slam.{module}.{function.__name__}", strict)
@@ -103,7 +103,7 @@ def two_rooms() -> tuple[FrameList, FrameList]:
     )
 
 
-def test_a_board_that_hangs_in_two_rooms_joins_them_not(
+def test_a_board_in_two_rooms_does_not_join_them(
     two_rooms: tuple[FrameList, FrameList], monkeypatch: pytest.MonkeyPatch
 ):
     keyframes, _ = tracked(*two_rooms)
@@ -123,7 +123,7 @@ def test_equal_panels_join_nothing():
     assert find_joins(keyframes, [], looking_at(here, there)) == []
 
 
-def test_frames_sought_in_vain_at_the_end_are_a_submap():
+def test_unlocalized_frames_at_the_end_are_a_submap():
     """Six frames of another place are fewer than relocalization tries."""
     here, there = walk(list(HERE[:6])), walk(list(HERE[:6]), seed=3)
     later = [replace(frame, t_ns=frame.t_ns + 2_000_000_000) for frame in there.frames]

@@ -43,7 +43,7 @@ def test_a_world_of_its_own_is_named_with_the_transform():
     assert np.linalg.norm(np.array(found[:3]) - ONE_FROM_TWO.translation) < 0.05
 
 
-def test_another_place_is_not_accused_but_noted():
+def test_another_place_is_noted_without_a_fault():
     (note,) = check_common_world([walked(0.0, "one"), walked(0.0, "two", seed=3)])
     assert "two: no picture shows a place of one" in note
 

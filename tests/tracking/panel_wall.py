@@ -22,7 +22,7 @@ from topoloc.tracking.tracker import Tracker
 CAMERA = Camera.pinhole(96, 72, 80.0, 80.0, 48.0, 36.0)
 INTERVAL_NS = 375_000_000
 STEP = 0.45
-"""Metres from picture to picture."""
+"""Metres from image to image."""
 _SIGMA = np.diag(np.full(6, 1e-6))
 
 

@@ -11,7 +11,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.tracking.stream_result import StreamedPose
 
 PANELS = (2.0, -1.0, 0.0, 1.0)
-"""Where a picture of panels alone may have been taken; the truth is third."""
+"""Possible offsets of an image that shows only panels. The truth is third."""
 
 
 def is_right(answer: StreamedPose, walk: Walk) -> bool:
@@ -27,7 +27,7 @@ def is_right(answer: StreamedPose, walk: Walk) -> bool:
 
 
 @pytest.mark.parametrize("has_odometry", [True, False])
-def test_after_something_unique_the_motion_decides(has_odometry: bool):
+def test_after_a_unique_place_the_motion_decides(has_odometry: bool):
     walk = Walk(has_odometry)
     for _ in range(4):
         assert walk.see(0.0).state == "localized"
@@ -59,7 +59,7 @@ def test_before_it_no_pose_is_claimed_and_all_are_named():
         assert is_right(walk.see(*PANELS), walk)
 
 
-def test_the_motion_decides_where_only_one_alternative_moves_as_the_camera_does():
+def test_the_motion_selects_the_only_alternative_that_moves_like_the_camera():
     walk, rng = Walk(), np.random.default_rng(1)
     answers = [walk.see(*rng.uniform(-9.0, 9.0, 2), 0.0) for _ in range(10)]
     assert [answer.state for answer in answers[:2]] == ["ambiguous"] * 2
@@ -67,7 +67,7 @@ def test_the_motion_decides_where_only_one_alternative_moves_as_the_camera_does(
 
 
 @pytest.mark.parametrize("num_wrong", [1, 2])
-def test_a_sure_answer_one_panel_off_is_not_believed(num_wrong: int):
+def test_a_certain_pose_one_panel_off_is_refused(num_wrong: int):
     walk = Walk()
     for _ in range(4):
         walk.see(0.0)
@@ -81,7 +81,7 @@ def test_a_sure_answer_one_panel_off_is_not_believed(num_wrong: int):
     assert is_right(last, walk)
 
 
-def test_a_stream_that_began_one_panel_off_is_overruled():
+def test_a_stream_that_began_one_panel_off_is_corrected():
     walk = Walk()
     assert not is_right(walk.see(1.0), walk)
     assert walk.see(0.0).state == "ambiguous"
@@ -91,7 +91,7 @@ def test_a_stream_that_began_one_panel_off_is_overruled():
         assert is_right(answer, walk)
 
 
-def test_a_pose_that_its_picture_is_not_sure_of_waits_for_the_next():
+def test_an_uncertain_pose_waits_for_the_next_image():
     walk = Walk()
     walk.wall.probability = 0.8
     first = walk.see(0.0)
@@ -105,7 +105,7 @@ def test_a_pose_that_its_picture_is_not_sure_of_waits_for_the_next():
 
 
 @pytest.mark.parametrize(("num_seen", "state"), [(1, "ambiguous"), (4, "predicted")])
-def test_pictures_without_a_pose_count_against_what_little_speaks_for(num_seen: int, state: str):
+def test_images_without_a_pose_lower_a_weak_belief(num_seen: int, state: str):
     walk = Walk()
     walk.wall.probability = 0.93
     assert [walk.see(0.0).state for _ in range(num_seen)] == ["localized"] * num_seen
@@ -138,7 +138,7 @@ def test_pictures_that_miss_the_true_pose_are_bridged():
     assert is_right(walk.see(*PANELS), walk)
 
 
-def test_where_one_pose_follows_the_map_is_asked_around_it_alone():
+def test_a_single_predicted_pose_is_searched_alone():
     walk = Walk()
     for _ in range(4):
         walk.see(0.0)

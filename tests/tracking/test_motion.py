@@ -47,7 +47,7 @@ def test_a_steady_motion_is_predicted():
     assert rotation_error(predicted.world_from_cam, truth) < 0.005
 
 
-def test_a_wrong_velocity_is_forgotten_where_poses_are_exact_and_times_uneven():
+def test_a_wrong_velocity_is_forgotten_with_exact_poses_and_uneven_times():
     exact = np.diag(np.full(6, 1e-12))
     state = start_motion(0, pose_at(0.0), exact)
     state = MotionState(
@@ -83,7 +83,7 @@ def _square(predicted: MotionState, world_from_cam: Rigid3) -> float:
     )
 
 
-def test_surprise_tells_noise_from_a_jump_whatever_the_origin():
+def test_surprise_distinguishes_noise_from_a_jump_at_any_origin():
     state = predict_motion(followed(20, noise=True), 20 * STEP_NS, CONFIG)
     truth = pose_at(1.0)
     assert _square(state, truth) < 33.0
@@ -113,7 +113,7 @@ def test_noise_is_averaged():
 
 
 def test_odometry_replaces_the_velocity():
-    share = 0.05  # of the way, the error of the odometry
+    share = 0.05  # relative error of the odometry
     state = start_motion(0, pose_at(0.0), SIGMA)
     motion = pose_at(0.0).inverse() @ pose_at(2.0)
     predicted = predict_motion(state, 2_000_000_000, CONFIG, motion)

@@ -43,7 +43,7 @@ def test_noise_has_a_floor_that_grows_with_the_depth():
     np.testing.assert_allclose(far, np.repeat([0.04, 0.002], 3), rtol=1e-2)
 
 
-def test_what_lasts_changes_with_the_view():
+def test_lasting_errors_change_with_the_view():
     errors = compute_pose_errors(found(0.1), 4.0, 0.001)
     still, step, far = (Rigid3(np.eye(3), np.array([way, 0.0, 0.0])) for way in (0.0, 0.04, 400.0))
     np.testing.assert_allclose(compute_correlated_change(errors, still), 0.0, atol=1e-15)

@@ -62,7 +62,7 @@ def test_nothing_is_predicted_before_the_first_pose_nor_long_after_the_last():
 
 
 @pytest.mark.parametrize(("new_evidence_ratio", "is_unambiguous"), [(1.0, True), (0.05, False)])
-def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(
+def test_an_uncertain_pose_is_reported_once_another_image_confirms_it(
     new_evidence_ratio: float, is_unambiguous: bool
 ):
     hypotheses = PoseHypotheses(MotionConfig())
@@ -75,7 +75,7 @@ def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(
     assert hypotheses.is_unambiguous == is_unambiguous
 
 
-def test_pictures_without_a_pose_count_against_what_little_speaks_for():
+def test_images_without_a_pose_lower_a_weak_belief():
     doubtful, established = PoseHypotheses(MotionConfig()), walked_a_second()
     doubtful.update_weights(0, one_of(at(0.0), sum_=0.95))
     assert doubtful.is_unambiguous
@@ -95,7 +95,7 @@ def test_odometry_carries_further():
     assert hypotheses.predict(10 * SECOND) is None, "odometry that stops is none"
 
 
-def test_a_jump_is_believed_when_the_next_poses_agree_with_it():
+def test_a_jump_is_accepted_when_the_next_poses_agree():
     hypotheses, decided, followed = walked_a_second(), [], []
     for k in range(1, 4):
         seen(hypotheses, SECOND + k * STEP_NS, at(1.0 + 0.1 * k, z=6.0))
@@ -110,7 +110,7 @@ def test_a_jump_is_believed_when_the_next_poses_agree_with_it():
     )
 
 
-def test_wild_poses_that_do_not_agree_are_never_believed():
+def test_random_poses_are_never_accepted():
     hypotheses, rng = walked_a_second(), np.random.default_rng(0)
     for k in range(1, 9):
         seen(hypotheses, SECOND + k * STEP_NS, Rigid3(np.eye(3), rng.uniform(-40, 40, 3)))
@@ -141,7 +141,7 @@ def test_the_motion_decides_between_alternatives_however_improbable_the_right_on
         assert best_x(hypotheses) == pytest.approx(x, abs=0.02)
 
 
-def test_answers_that_miss_the_true_pose_begin_a_doubt_and_no_more():
+def test_results_without_the_true_pose_keep_the_belief():
     hypotheses = walked_a_second()
     seen(hypotheses, SECOND + STEP_NS, at(5.1), at(6.1), at(7.1))
     assert hypotheses.is_unambiguous
@@ -149,7 +149,7 @@ def test_answers_that_miss_the_true_pose_begin_a_doubt_and_no_more():
     assert best_x(hypotheses) == pytest.approx(1.1, abs=0.02)
 
 
-def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
+def test_equal_panels_stay_ambiguous_until_a_unique_place():
     hypotheses = PoseHypotheses(MotionConfig())
     for k in range(8):
         seen(
@@ -170,7 +170,7 @@ def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
     assert best_x(hypotheses) == pytest.approx(2.8, abs=0.01)
 
 
-def test_the_motion_decides_between_alternatives_of_which_only_one_moves_as_the_camera_does():
+def test_the_motion_selects_the_only_alternative_that_moves_like_the_camera():
     hypotheses, rng = PoseHypotheses(MotionConfig()), np.random.default_rng(2)
     decided = []
     for k in range(6):

@@ -45,7 +45,7 @@ def test_an_outlier_is_outvoted():
     assert translation_error(smoothed.inverse(), truths(8)[-1].inverse()) < 0.02
 
 
-def test_a_cleared_window_begins_where_it_is_told():
+def test_a_cleared_window_begins_at_the_next_pose():
     window = PoseWindow(size=4)
     for truth in truths(6):
         window.add(truth, MEASURED, STEP, MOVED)

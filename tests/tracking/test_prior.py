@@ -17,7 +17,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.tracking.tracker import Tracker
 
 ROUGHLY = np.diag([0.25, 0.25, 0.01, 0.01, 0.01, 0.07])
-"""What RViz gives, about the position."""
+"""Covariance about the position, as RViz sends it."""
 ASIDE = Rigid3(np.eye(3), np.array([0.3, -0.2, 0.05]))
 
 
@@ -31,7 +31,7 @@ def doubled(room_map: Path) -> Localizer:
 
 
 @pytest.mark.parametrize("place", [Rigid3.identity(), ELSEWHERE])
-def test_it_decides_between_two_rooms_that_look_alike(doubled: Localizer, place: Rigid3):
+def test_it_decides_between_two_similar_rooms(doubled: Localizer, place: Rigid3):
     stream = room_stream()[:4]
     tracker = Tracker(doubled)
     states = [tracker.process(image, CAMERA, t_ns).state for t_ns, image, _ in stream]
@@ -57,7 +57,7 @@ def test_it_is_no_result(room_map: Path):
     assert not isinstance(answer.result, Localization)
 
 
-def test_a_wrong_one_is_overruled(room_map: Path):
+def test_a_wrong_prior_is_corrected(room_map: Path):
     tracker = Tracker(Localizer(TopoMetricMap.load(room_map)))
     wrong, (image, truth) = room_stream()[0][2], far_away()[0]
     tracker.expect(wrong, np.diag([1e-4] * 6), 0)

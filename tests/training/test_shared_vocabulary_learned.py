@@ -20,7 +20,7 @@ def _picture(seed: int, noise_seed: int) -> tuple[Features, int, int]:
     return Features(points, zero, zero, zero, unit), 200, 200
 
 
-def test_places_are_told_apart():
+def test_places_are_distinguished():
     recordings = {
         "a": [_picture(seed, seed) for seed in range(12)],
         "b": [_picture(seed, seed) for seed in range(12, 24)],
@@ -34,7 +34,7 @@ def test_places_are_told_apart():
     assert np.array_equal(np.argmax(asked @ mapped.T, axis=1), np.arange(24))
 
 
-def test_the_file_holds_what_was_learned():
+def test_the_file_contains_the_learned_words():
     vocabulary = learn_vocabulary(
         "surf", {"a": [_picture(seed, seed) for seed in range(8)]}, num_words=4, dimension=8
     )

@@ -50,7 +50,7 @@ def copied_map(room_map: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(room_map, tmp_path / "room.topo"))
 
 
-def test_a_map_learns_and_is_asked(
+def test_a_map_is_trained_and_queried(
     copied_map: Path,
     small: tuple[str, ...],
     queries: Path,
@@ -103,7 +103,7 @@ def test_a_map_learns_and_is_asked(
     assert "surf-vlad (default)" in printed
 
 
-def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(
+def test_the_default_changes_on_request_and_the_map_can_stay(
     copied_map: Path, small: tuple[str, ...], weights_file: Path, tmp_path: Path
 ):
     data, out = copied_map.read_bytes(), tmp_path / "new.topo"
@@ -119,7 +119,7 @@ def test_the_default_changes_when_asked_to_and_the_map_can_stay_as_it_is(
     assert TopoMetricMap.load(out).default_coarse == "cnn-nn"
 
 
-def test_cnn_fc_needs_no_weights_and_says_what_that_costs(
+def test_cnn_fc_needs_no_weights_and_warns(
     copied_map: Path, small: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ):
     assert (
@@ -202,7 +202,7 @@ def test_without_torch_the_extra_is_named(
     assert answer.returncode == 1
 
 
-def test_mapping_and_asking_surf_vlad_loads_no_torch(copied_map: Path, queries: Path):
+def test_mapping_and_queries_with_surf_vlad_load_no_torch(copied_map: Path, queries: Path):
     code = (
         "import sys; from topoloc.apps.cli import main; main(sys.argv[1:]); print('torch' in"
         " sys.modules)"

@@ -32,7 +32,7 @@ def netvlad_tensors(num_clusters: int = 64) -> dict[str, torch.Tensor]:
     }
 
 
-def test_a_file_is_read_and_known_by_its_hash(random_file: Path):
+def test_a_file_is_read_and_identified_by_its_hash(random_file: Path):
     weights = read_weights(random_file, "squeezenet1_1")
     assert weights.sha256 == hashlib.sha256(random_file.read_bytes()).hexdigest()
     network = Backbone("squeezenet1_1", num_outputs=None, depth=5)
@@ -58,7 +58,7 @@ def test_weights_of_another_network_are_named(random_file: Path):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
-def test_a_truncated_file_is_told(random_file: Path, tmp_path: Path, share: float):
+def test_a_truncated_file_is_an_error(random_file: Path, tmp_path: Path, share: float):
     path = tmp_path / "cut.pth"
     data = random_file.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
@@ -66,7 +66,7 @@ def test_a_truncated_file_is_told(random_file: Path, tmp_path: Path, share: floa
         read_weights(path, "squeezenet1_1")
 
 
-def test_a_missing_file_and_a_file_that_is_none_are_told(tmp_path: Path):
+def test_missing_and_invalid_files_are_errors(tmp_path: Path):
     with pytest.raises(WeightsError, match="cannot read weights"):
         read_weights(tmp_path / "none.pth", "squeezenet1_1")
     torch.save({"epoch": 3}, tmp_path / "other.pth")
@@ -74,7 +74,7 @@ def test_a_missing_file_and_a_file_that_is_none_are_told(tmp_path: Path):
         read_weights(tmp_path / "other.pth", "squeezenet1_1")
 
 
-def test_numbers_that_are_not_finite_are_told(random_file: Path, tmp_path: Path):
+def test_numbers_that_are_not_finite_are_an_error(random_file: Path, tmp_path: Path):
     tensors = torch.load(random_file, weights_only=True)
     tensors["features.0.bias"][3] = torch.nan
     torch.save(tensors, tmp_path / "nan.pth")
@@ -112,7 +112,7 @@ def test_the_public_netvlad_checkpoint_is_understood(tmp_path: Path):
         read_weights(tmp_path / "netvlad.pth", "squeezenet1_1")
 
 
-def test_a_netvlad_layer_that_does_not_fit_is_told(tmp_path: Path):
+def test_a_netvlad_layer_of_another_size_is_an_error(tmp_path: Path):
     tensors = netvlad_tensors()
     tensors["pool.centroids"] = torch.zeros(32, 512)
     torch.save({"state_dict": tensors}, tmp_path / "bad.pth")
@@ -122,7 +122,7 @@ def test_a_netvlad_layer_that_does_not_fit_is_told(tmp_path: Path):
         read_weights(tmp_path / "bad.pth", "vgg16")
 
 
-def test_offline_it_says_what_to_fetch_and_where_to_put_it(
+def test_offline_the_error_names_the_file_and_its_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     def offline(*args: object, **kwargs: object):
@@ -152,7 +152,7 @@ def test_published_weights_are_fetched_once_and_their_hash_is_checked(
     name = f"squeezenet1_1-{hashlib.sha256(data).hexdigest()[:8]}.pth"
     monkeypatch.setitem(weights_module._PUBLISHED, "squeezenet1_1", name)
     assert find_weights("squeezenet1_1", None) is not None
-    monkeypatch.setattr(urllib.request, "urlopen", None)  # from the cache: not asked again
+    monkeypatch.setattr(urllib.request, "urlopen", None)  # from the cache: no second download
     assert find_weights("squeezenet1_1", None) is not None
 
 
@@ -161,7 +161,7 @@ def test_scratch_and_our_own_backbone_begin_with_nothing():
     assert find_weights("compact", None) is None
 
 
-def test_the_published_weights_load_and_tell_pictures_apart(squeezenet_file: Path):
+def test_the_published_weights_load_and_distinguish_images(squeezenet_file: Path):
     network = Backbone("squeezenet1_1", num_outputs=None).eval()
     network.load_state_dict(torch.load(squeezenet_file, weights_only=True))
     checks = (torch.arange(96)[:, None] // 8 + torch.arange(96)[None] // 8) % 2

@@ -21,7 +21,7 @@ from topoloc_worlds.worlds import find_world
 
 
 @pytest.mark.slow  # the light of two conditions is traced
-def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_rendering_resumes_after_a_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("mitsuba")
     small = Camera.pinhole(32, 20, 19.0, 19.0, 15.5, 9.5)
     tiny = [
@@ -59,7 +59,7 @@ def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.jpg")} == before
 
 
-def test_who_asks_walks_otherwise_than_who_mapped():
+def test_queries_take_other_paths_than_mapping():
     """No query image may repeat a mapping frame."""
     lab = find_world("lab")
     walks = {
@@ -93,7 +93,7 @@ def test_every_recording_is_made_and_has_its_use():
     assert set(ROLES.values()) == {"map", "queries", "elsewhere"}
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path):
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path):
     (tmp_path / "file").write_text("")
     for write in (draw_pictures_of_nothing, render_recordings):
         with pytest.raises(TopolocError, match="cannot write"):

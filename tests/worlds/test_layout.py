@@ -145,7 +145,7 @@ def test_a_full_disk_leaves_no_half_files(tmp_path: Path, monkeypatch: pytest.Mo
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
 
 
-def test_what_a_killed_run_had_half_written_goes(tmp_path: Path):
+def test_partial_files_of_a_killed_run_are_removed(tmp_path: Path):
     layout = Layout(tmp_path, CAMERA, 0.12)
     write(layout, frames=(0,))
     half = tmp_path / layout.left / ".000001.png.77.part"

@@ -49,7 +49,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_recording_is_whole_and_says_how_it_was_made(recorded: Path):
+def test_a_recording_is_complete_with_its_settings(recorded: Path):
     assert len(files(recorded)) == 3 * 4 + 4
     sequence = open_sequence(recorded)
     assert len(sequence) == 4
@@ -64,7 +64,7 @@ def test_a_recording_is_whole_and_says_how_it_was_made(recorded: Path):
     )
 
 
-def test_another_run_gives_the_same_bytes_whatever_the_number_of_processes(
+def test_another_run_gives_the_same_bytes_with_any_number_of_processes(
     recorded: Path, tmp_path: Path
 ):
     record(BOX_WORLD, DAY, tmp_path / "box", CONFIG, processes=2)
@@ -138,7 +138,7 @@ def test_truth_agrees_with_the_rendered_geometry(recorded: Path):
     assert np.median(np.linalg.norm(back - grid[inside], axis=1)) < 0.1
 
 
-def test_depth_tells_where_a_point_is_in_the_right_picture(tmp_path: Path):
+def test_depth_predicts_the_point_in_the_right_image(tmp_path: Path):
     camera = Camera.pinhole(160, 100, 95.0, 95.0, 79.5, 49.5)
     quiet = SensorConfig(full_well=1e9, read_noise=0.0)
     fine = replace(
@@ -203,6 +203,6 @@ def test_cameras_that_cannot_be_rendered(change: dict[str, object]):
 
 
 @pytest.mark.parametrize("change", [{"jpeg": 0}, {"num_renderings": 0}, {"lens_drops": -1}])
-def test_settings_that_cannot_be(change: dict[str, int]):
+def test_impossible_settings_are_refused(change: dict[str, int]):
     with pytest.raises(TopolocError):
         replace(CONFIG, **change)  # type: ignore[arg-type]

@@ -41,7 +41,7 @@ def test_exposure_makes_any_daylight_mid_grey(radiance: float):
     assert 0.40 < taken.mean() / 255 < 0.48, "0.16 in sRGB is 0.44"
 
 
-def test_where_light_fails_time_goes_first_then_gain_then_the_picture():
+def test_in_the_dark_time_grows_first_then_gain_then_the_image_darkens():
     bright, dim, dark = (
         choose_exposure(evenly(radiance), CONFIG) for radiance in (1.0, 0.005, 1e-5)
     )

@@ -38,7 +38,7 @@ def simulate(*args: object) -> int:
 
 
 @pytest.mark.usefixtures("no_rendering")
-def test_it_writes_a_recording_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_it_writes_a_recording_with_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out, facts = tmp_path / "day", tmp_path / "facts.json"
     assert simulate("lab", out, "--num-frames", 3, "--json", facts) == 0
     assert capsys.readouterr().out.startswith(f"{out}: 3 stereo pairs, 0.")
@@ -109,7 +109,7 @@ def test_a_camera_file_and_a_part_of_a_lap(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("no_rendering")
-def test_interrupted_it_says_how_to_go_on(
+def test_an_interruption_names_the_command_to_resume(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     whole = recorder.shoot

@@ -27,7 +27,7 @@ def column_of(picture: np.ndarray) -> float:
     return float(change @ np.arange(320) / change.sum())
 
 
-def test_a_drop_is_seen_by_both_cameras_where_geometry_says():
+def test_a_drop_is_at_the_right_pixels_of_both_cameras():
     drops = one_drop(0.1, 0.3, 2.0)
     left = draw_rain(street(), WALL, CAMERA, Rigid3.identity(), drops, 0.005)
     right = draw_rain(street(), WALL, CAMERA, RIGHT_FROM_LEFT, drops, 0.005)
@@ -35,7 +35,7 @@ def test_a_drop_is_seen_by_both_cameras_where_geometry_says():
     assert abs(column_of(left) - column_of(right) - 190.0 * 0.5 / 2.0) < 0.2
 
 
-def test_drops_are_brighter_than_the_road_and_hidden_by_what_is_nearer():
+def test_drops_are_brighter_than_the_road_and_hidden_by_nearer_objects():
     drops = one_drop(0.0, 0.4, 2.0)
     rainy = draw_rain(street(), WALL, CAMERA, Rigid3.identity(), drops, 0.005)
     assert rainy.max() <= 1.0

@@ -129,7 +129,7 @@ def test_inverse_poses_are_named_and_mended(
     assert main([*build, "--poses", "upside-down"]) == 1
 
 
-def test_localize_writes_what_the_interface_says(
+def test_localize_writes_the_documented_json(
     room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     results, trajectory = tmp_path / "results.jsonl", tmp_path / "found.tum"
@@ -256,7 +256,7 @@ def test_unreadable_pictures_are_results_and_fail_only_alone(
     assert errors.count("\n") == 1
 
 
-def test_an_interrupted_run_keeps_what_there_is(
+def test_an_interrupted_run_keeps_its_results(
     room_map: Path,
     queries: Path,
     tmp_path: Path,
@@ -283,7 +283,7 @@ def test_an_interrupted_run_keeps_what_there_is(
     assert os.listdir(tmp_path) == ["results.jsonl"]
 
 
-def test_evaluate_writes_what_the_interface_says(
+def test_evaluate_writes_the_documented_json(
     room_map: Path,
     queries: Path,
     elsewhere: Path,
@@ -358,7 +358,7 @@ def test_a_report_needs_no_truth(
     ],
     ids=["1x1", "1x1500", "black", "white", "noise", "another world"],
 )
-def test_a_picture_of_nothing_known_is_not_localized(
+def test_an_out_of_map_image_is_not_localized(
     picture: np.ndarray, room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert cv2.imwrite(str(tmp_path / "query.png"), picture)
@@ -420,7 +420,7 @@ def test_a_query_may_be_given_a_time(
     assert given == [None, 0.0, 50.0, 80.0]
 
 
-def test_a_query_without_a_pose_says_where_time_was_up(
+def test_a_query_without_a_pose_reports_the_time_limit(
     room_map: Path, elsewhere: Path, tmp_path: Path
 ):
     assert (
@@ -472,7 +472,7 @@ def test_fifty_megapixels_need_little_memory_and_no_matplotlib(room_map: Path, t
 
 
 @pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
-def test_blas_has_one_thread_unless_the_user_says_otherwise(given: dict[str, str], expected: str):
+def test_blas_has_one_thread_unless_the_user_sets_more(given: dict[str, str], expected: str):
     environment = {
         name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"
     } | given

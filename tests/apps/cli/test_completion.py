@@ -57,7 +57,7 @@ def test_scripts_name_all_commands_and_are_read_by_their_shell(shell: str, tmp_p
         (("topoloc", "info", "office.to"), []),
     ],
 )
-def test_bash_offers_what_fits(words: tuple[str, ...], offered: list[str], tmp_path: Path):
+def test_bash_completes_the_word(words: tuple[str, ...], offered: list[str], tmp_path: Path):
     assert _complete(tmp_path, *words) == offered
 
 
@@ -71,7 +71,7 @@ def test_bash_offers_each_command_and_each_option(tmp_path: Path):
 
 
 @pytest.mark.skipif(shutil.which("fish") is None, reason="needs fish")
-def test_fish_offers_what_fits(tmp_path: Path):
+def test_fish_completes_the_word(tmp_path: Path):
     (tmp_path / "script").write_text(_script("fish"), encoding="utf-8")
     for typed, offered in (("topoloc certi", "certify"), ("topoloc info a --ch", "--check")):
         code = f"source {tmp_path / 'script'}; complete -C '{typed}'"

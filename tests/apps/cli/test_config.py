@@ -20,7 +20,7 @@ FileOf = Callable[[str], str]
 MAX_OPTIONS, MAX_LINES = 25, 80
 
 
-def test_what_config_prints_is_read_back_as_the_defaults(
+def test_the_output_of_config_is_read_back_as_the_defaults(
     capsys: pytest.CaptureFixture[str], file_of: FileOf
 ):
     assert main(["config"]) == 0

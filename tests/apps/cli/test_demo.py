@@ -44,7 +44,7 @@ def _rows(evaluation: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {row["name"]: row for row in evaluation["recordings"]}
 
 
-def test_the_demo_maps_asks_and_reports(
+def test_the_demo_maps_localizes_and_reports(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out, told = tmp_path / "out", tmp_path / "evaluation.json"
@@ -108,7 +108,7 @@ def test_without_matplotlib_all_but_the_report_is_done(
     }
 
 
-@pytest.mark.slow  # the tests of quickstart and examples map and ask the same recordings
+@pytest.mark.slow  # the tests of quickstart and examples use the same recordings
 @pytest.mark.skipif(
     bool(find_missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
 )
@@ -138,7 +138,7 @@ def test_recordings_that_are_not_there_are_named(
     )
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_the_work(
+def test_a_read_only_folder_is_an_error_before_the_work(
     room: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     (tmp_path / "file").write_text("not a folder")

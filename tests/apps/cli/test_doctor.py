@@ -72,7 +72,7 @@ def test_json_alone_goes_to_standard_output(
     assert set(json.loads(capsys.readouterr().out)) == {*doctor._PARTS, "faults"}
 
 
-def test_a_missing_extra_is_told_with_its_line_for_pip(
+def test_a_missing_extra_is_reported_with_its_pip_command(
     no_self_test: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     versions = {"matplotlib": "3.7.9", "carla": None, "numpy": "1.9", "tyro": None}
@@ -154,7 +154,7 @@ def test_without_a_place_for_compiled_code_it_names_the_variable(
     assert f"{tmp_path / 'file' / 'below'} cannot be written; NUMBA_CACHE_DIR names" in line
 
 
-def test_with_a_broken_library_it_still_tells_the_rest_and_other_commands_one_line(tmp_path: Path):
+def test_a_broken_library_is_one_fault_and_one_line_of_other_commands(tmp_path: Path):
     (tmp_path / "cv2.py").write_text("raise ImportError('libGL.so.1: no such file')\n")
     path = os.pathsep.join([str(tmp_path), *sys.path])
     answer = _run("-m", "topoloc", "doctor", PYTHONPATH=path)

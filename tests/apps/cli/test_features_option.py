@@ -63,7 +63,7 @@ def _answers(capfd: pytest.CaptureFixture[str], *args: object) -> tuple[list[dic
     return [json.loads(line) for line in printed.out.splitlines()], printed.err
 
 
-def test_a_map_of_two_kinds_is_built_and_named(
+def test_a_map_of_two_feature_types_is_built_and_named(
     tiny_recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
     target = tmp_path / "room.topo"
@@ -76,7 +76,7 @@ def test_a_map_of_two_kinds_is_built_and_named(
     assert (info["kinds"], info["coarse"]) == (["surf", "sift"], ["surf-vlad", "surf-vlad@sift"])
 
 
-def test_it_is_asked_by_the_kinds_that_are_named(
+def test_queries_use_the_named_feature_types(
     map_of_two: Path, queries: Path, capfd: pytest.CaptureFixture[str]
 ):
     by = {
@@ -95,7 +95,7 @@ def test_it_is_asked_by_the_kinds_that_are_named(
     )
 
 
-def test_kinds_that_are_not_to_be_had_are_one_line(
+def test_missing_feature_types_are_one_line(
     map_of_two: Path,
     room_map: Path,
     queries: Path,
@@ -119,7 +119,7 @@ def test_kinds_that_are_not_to_be_had_are_one_line(
         )
 
 
-def test_kinds_that_cannot_be_asked_are_named_in_one_line(
+def test_feature_types_without_a_network_are_one_line(
     built: Callable[..., Path],
     queries: Path,
     capfd: pytest.CaptureFixture[str],
@@ -143,7 +143,7 @@ def test_kinds_that_cannot_be_asked_are_named_in_one_line(
     assert _answers(capfd, small, picture, "--camera", "map")[1] == ""
 
 
-def test_a_map_of_no_other_kind_is_an_error_in_one_line(
+def test_a_map_without_the_named_type_is_one_line(
     built: Callable[..., Path], queries: Path, complaint: Complaint
 ):
     small = built("xfeat")

@@ -43,7 +43,7 @@ def test_commands_do_their_work_or_change_nothing(tiny_recording: Path, tmp_path
     assert ("atlas create", "handles") in refused
 
 
-def test_what_is_written_before_a_failure_is_named(
+def test_outputs_written_before_a_failure_are_named(
     room_map: Path,
     queries: Path,
     tmp_path: Path,

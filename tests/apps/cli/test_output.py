@@ -152,7 +152,7 @@ def test_output_that_cannot_be_written_is_one_line_at_most(
     )
 
 
-def test_who_closes_the_output_wants_none(room_map: Path):
+def test_a_closed_output_is_no_error(room_map: Path):
     command = [sys.executable, "-m", "topoloc", "info", str(room_map), "--json", "-"]
     close = "import os, sys; os.close(1); os.execv(sys.argv[1], sys.argv[1:])"
     done = subprocess.run(
@@ -161,7 +161,7 @@ def test_who_closes_the_output_wants_none(room_map: Path):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_printed_refusal_says_why_in_one_short_line():
+def test_a_printed_refusal_has_its_reason_in_one_short_line():
     refusal = NotLocalized(
         "ambiguous", detail="as much like node 3 as\nlike node 7 " + 99 * "or so "
     )

@@ -135,7 +135,7 @@ def test_a_part_of_a_table_changes_that_part_alone(file_of: FileOf):
     ids=lambda value: str(value)[:30],
 )
 @pytest.mark.usefixtures("cart")
-def test_what_is_wrong_is_named_with_file_and_key(content: str | bytes, said: str, file_of: FileOf):
+def test_errors_name_file_and_key(content: str | bytes, said: str, file_of: FileOf):
     path = file_of(content)
     with pytest.raises(ConfigError) as raised:
         read_settings(path)
@@ -188,7 +188,7 @@ def _refusal(read: Callable[[], Any]) -> str | None:
 @pytest.mark.parametrize("name", all_tables())
 @settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_whatever_a_table_holds_it_is_read_or_refused_by_its_key(name: str, data: st.DataObject):
+def test_any_table_is_read_or_refused_by_its_key(name: str, data: st.DataObject):
     before, table = config_class(name)(), data.draw(_trees(name))
     said = _refusal(lambda: check_bounds(parse_settings(type(before), table, name, before)))
     assert said is None or said.startswith(name)
@@ -200,7 +200,7 @@ def test_whatever_a_table_holds_it_is_read_or_refused_by_its_key(name: str, data
     | st.text(max_size=60).map(str.encode)
     | st.sampled_from([f"[{name}]\nx = 1".encode() for name in all_tables()])
 )
-def test_whatever_a_file_holds_it_is_read_or_refused(tmp_path: Path, content: bytes):
+def test_any_file_is_read_or_refused(tmp_path: Path, content: bytes):
     path = tmp_path / "fuzz.toml"
     path.write_bytes(content)
     said = _refusal(lambda: read_settings(str(path)))

@@ -109,7 +109,7 @@ def test_files_that_are_no_weights_are_refused(
     assert not converter
 
 
-def test_what_is_missing_is_said(
+def test_missing_weights_are_named(
     tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, complaint: Callable[..., str]
 ):
     monkeypatch.setattr(weights, "entry_points", lambda group: [])

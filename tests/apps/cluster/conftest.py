@@ -20,7 +20,7 @@ _NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_dashboard": 
 def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder for temporary files of the cluster's workers."""
     folder = tmp_path_factory.mktemp("scratch")
-    (folder / "ray").mkdir()  # where Ray notes the address of the last cluster
+    (folder / "ray").mkdir()  # Ray stores the address of the last cluster here
     return folder
 
 

@@ -83,7 +83,7 @@ def test_pairs_are_joined_as_on_one_machine(
     assert (shared / "atlas.json").read_bytes() == before
 
 
-def test_a_pair_whose_worker_ended_is_told(
+def test_a_pair_whose_worker_ended_is_a_failure(
     pieces: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

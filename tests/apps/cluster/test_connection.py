@@ -35,14 +35,14 @@ def ray():
         ("ray://127.0.0.1:10001", "Ray clients are not supported"),
     ],
 )
-def test_addresses_that_are_none(
+def test_invalid_addresses_are_refused(
     address: str, says: str, tiny_recording: Path, tmp_path: Path, complaint: Complaint
 ):
     assert says in complaint("build", tiny_recording, tmp_path / "campus", "--ray", address)
 
 
 @needs_ray
-def test_nobody_answers(
+def test_an_address_without_a_cluster_is_refused(
     tiny_recording: Path, tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch
 ):
     with socket.create_server(("127.0.0.1", 0)) as taken:
@@ -99,7 +99,7 @@ def test_a_cluster_of_our_own_has_a_token_of_its_own(monkeypatch: pytest.MonkeyP
     assert os.environ["RAY_AUTH_MODE"] == "disabled"
 
 
-def test_what_is_written_past_python_is_not_seen(capfd: pytest.CaptureFixture[str]):
+def test_output_of_libraries_is_hidden(capfd: pytest.CaptureFixture[str]):
     with _silence_stderr():
         os.write(2, b"a warning of C++")
     os.write(2, b"ours")

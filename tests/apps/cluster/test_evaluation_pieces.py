@@ -56,7 +56,7 @@ def _evaluated(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[Any, 
     return _timeless(json.loads(printed.out)), printed.err
 
 
-def test_the_same_figures_whoever_dies(
+def test_equal_figures_although_workers_die(
     cluster: Any,
     queried_map: Path,
     capsys: pytest.CaptureFixture[str],
@@ -125,7 +125,7 @@ def test_failures_are_those_of_the_plain_command(
         )
 
 
-def test_against_itself_asks_no_cluster(room_map: Path, complaint: Complaint):
+def test_against_itself_refuses_a_cluster(room_map: Path, complaint: Complaint):
     assert "without --ray" in complaint(
         "evaluate", room_map, "--against-itself", "--ray", "local", status=2
     )
@@ -155,7 +155,7 @@ def test_a_piece_travels_small_and_answers_as_here(piece: Piece, queries: Path):
     assert evaluation["median_translation_m"] < 0.01
 
 
-def test_another_map_in_its_place_is_not_asked(piece: Piece, queried_map: Path):
+def test_another_map_in_its_place_is_refused(piece: Piece, queried_map: Path):
     packed = pickle.dumps(piece)
     with TopoMetricMap.load(queried_map / "room.topo") as topomap:
         replace(topomap, length_m=3.0).save(queried_map / "new.topo")
@@ -164,7 +164,7 @@ def test_another_map_in_its_place_is_not_asked(piece: Piece, queried_map: Path):
         pickle.loads(packed).run(_silent)
 
 
-def test_another_recording_in_its_place_is_not_asked(piece: Piece, queried_map: Path):
+def test_another_recording_in_its_place_is_refused(piece: Piece, queried_map: Path):
     (queried_map / "pictures" / "view00.png").rename(queried_map / "pictures" / "a.png")
     with pytest.raises((RecordingError, TrajectoryError)):
         piece.run(_silent)

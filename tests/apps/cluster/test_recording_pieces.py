@@ -60,7 +60,7 @@ def test_the_pieces_of_one_trajectory_are_one_world(long_walk: Path):
     assert whole.world is None
 
 
-def test_what_cannot_be_split_is_said(long_walk: Path, tmp_path: Path):
+def test_a_recording_that_cannot_be_split_is_an_error(long_walk: Path, tmp_path: Path):
     with pytest.raises(UsageError, match="takes whole recordings"):
         split_recording(_making(Path(f"{long_walk}@0::1")), "walk", SplitOptions(6, 3))
     for frames, shared in ((6, 4), (6, 2), (0, 0)):

@@ -89,7 +89,7 @@ def test_a_tile_is_made_once(job: TileJob, room_map: Path, tmp_path: Path):
     assert (tmp_path / "campus" / "atlas.json").read_bytes() == before
 
 
-def test_what_was_made_otherwise_is_replaced_only_when_it_is_said(job: TileJob, tmp_path: Path):
+def test_a_tile_of_other_settings_is_replaced_only_on_request(job: TileJob, tmp_path: Path):
     where = str(tmp_path / "campus")
     TileTask(job, where, False).run(_nothing)
     otherwise = replace(job, maker=replace(job.maker, digits="cd"))

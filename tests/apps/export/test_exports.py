@@ -94,7 +94,7 @@ def test_pycolmap_reads_the_model_and_its_tracks_fit(room_map: Path, scene: Scen
             image["rotation"], view.world_from_cam.inverse().rotation, atol=1e-9
         )
     errors = np.concatenate([image["errors"] for image in model["images"].values()])
-    assert errors.mean() < 1.0  # the worst that is let in is 1.5 pixels, in pictures of 320
+    assert errors.mean() < 1.0  # tracks allow 1.5 pixels, in images of 320
     assert errors.max() < 2.0
     assert np.median(errors) < 0.5
     assert np.mean(np.array(model["tracks"]) >= 3) > 0.3
@@ -139,7 +139,7 @@ def test_nerfstudio_finds_pictures_cameras_and_poses(
         assert frame["file_path"].endswith(".webp")
         assert view.image_camera is not None
         assert (frame["w"], frame["h"]) == (view.image_camera.width, view.image_camera.height)
-        # a point in front of the camera lies at negative z in OpenGL's axes, and where its pixel is
+        # a point in front of the camera has negative z in OpenGL's axes, and the right pixel
         seen = np.flatnonzero(view.point_rows >= 0)[:20]
         world = scene.points.world[view.point_rows[seen]]
         gl = (
@@ -179,7 +179,7 @@ def test_evo_reads_trajectories(placed_map: Path, results: Path, scene: Scene, t
     np.testing.assert_allclose(
         kitti.poses_se3, [pose.matrix() for pose in scene.trajectory], atol=1e-9
     )
-    assert len(kitti.poses_se3) == 14  # all mapping pictures
+    assert len(kitti.poses_se3) == 14  # all mapping images
     asked = file_interface.read_tum_trajectory_file(export(results, tmp_path / "asked.tum"))
     lines = [json.loads(line) for line in results.read_text().splitlines()]
     np.testing.assert_allclose(

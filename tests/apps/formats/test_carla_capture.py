@@ -171,17 +171,17 @@ def client_of(world: StandInWorld) -> SimpleNamespace:
     return SimpleNamespace(get_world=lambda: world)
 
 
-def test_a_way_is_recorded(tmp_path: Path):
+def test_a_route_is_recorded(tmp_path: Path):
     world = StandInWorld()
     with RecordingWriter(tmp_path / "out") as writer:
         for frame in carla_frames(carla, client_of(world), CONFIG, SIZE):
             assert world.settings.synchronous_mode
             writer.write(frame)
     read = open_sequence(tmp_path / "out")
-    assert len(read) == 10  # 0 to 9 m, where the lane ends
+    assert len(read) == 10  # 0 to 9 m, the end of the lane
     assert (np.diff(read.t_ns) == 100_000_000).all()
     for index, pose in enumerate(read.poses):
-        assert pose is not None  # to the right of a lane along y is -x; up 1.6 m; y is mirrored
+        assert pose is not None  # right is -x, the height is 1.6 m, y is mirrored
         np.testing.assert_allclose(pose.translation, [58.0, -float(index), 1.8], atol=1e-4)
         np.testing.assert_allclose(pose.rotation[:, 2], [0.0, -1.0, 0.0], atol=1e-5)
     last = read[9]

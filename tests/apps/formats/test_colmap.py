@@ -188,7 +188,7 @@ def test_a_trajectory_gives_scale_and_world(model: Make, tmp_path: Path, kind: s
     sequence = open_sequence(model(names=names))
     metric_from_true = Rigid3(pose(5).rotation, np.array([10.0, 20.0, 30.0]))
     theirs = [metric_from_true @ true_pose(index) for index in range(4)]
-    # a measured trajectory knows where the camera was, hardly how it was turned
+    # a measured trajectory has positions, but no exact rotations
     measured = [Rigid3(np.eye(3), world_from_cam.translation) for world_from_cam in theirs]
     file = tmp_path / "gnss.txt"
     rows = [
@@ -221,7 +221,7 @@ def test_names_that_lead_out_of_the_folder(model: Make, name: str):
         open_sequence(model(names=(name, "b.png")))
 
 
-def test_a_camera_model_that_is_not_known(model: Make):
+def test_an_unknown_camera_model_is_refused(model: Make):
     with pytest.raises(CalibrationError, match="unknown camera model 'FOV'"):
         open_sequence(model(model="FOV", params=[40.0, 41.0, 16.0, 12.0, 0.5]))
 
@@ -236,7 +236,7 @@ def test_damaged_models(model: Make, file: str, binary: bool, capfd: pytest.Capt
         path.write_bytes(data)
         with suppress(
             RecordingError, TrajectoryError
-        ):  # what is cut off may be a whole model of fewer things
+        ):  # a truncated file may be a valid model with fewer entries
             open_colmap(root)
     path.write_bytes(b"\xff" * 200)
     with pytest.raises(RecordingError, match="damaged, or no model of COLMAP"):

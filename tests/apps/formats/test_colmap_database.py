@@ -88,7 +88,7 @@ def test_a_model_beside_it_counts(database: Make, tmp_path: Path):
         ("DROP TABLE cameras", "no database of COLMAP, or damaged"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(database: Make, change: str, said: str):
+def test_faults_are_one_line(database: Make, change: str, said: str):
     root = database()
     with closing(sqlite3.connect(root / "database.db")) as opened:
         opened.executescript(f"PRAGMA foreign_keys = OFF; {change};")
@@ -98,7 +98,7 @@ def test_what_is_wrong_is_said_in_one_line(database: Make, change: str, said: st
     assert "\n" not in str(raised.value)
 
 
-def test_no_pictures_are_said(database: Make):
+def test_a_database_without_images_is_refused(database: Make):
     root = database()
     (root / "images").rename(root / "elsewhere")
     with pytest.raises(RecordingError, match="--images"):

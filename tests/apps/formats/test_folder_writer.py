@@ -80,7 +80,7 @@ def test_depth_comes_back(tmp_path: Path):
         assert one.depth is not None
         np.testing.assert_allclose(
             its.depth.depth, one.depth.depth, atol=0.0021
-        )  # half a step; NaN where it is unknown
+        )  # half a step, NaN if unknown
         assert its.world_from_cam is None
 
 
@@ -97,7 +97,7 @@ def test_readable_after_each_frame(tmp_path: Path):
             assert len(open_sequence(tmp_path / "out")) == index + 1
 
 
-def test_what_is_there_is_never_overwritten(tmp_path: Path):
+def test_existing_files_are_never_overwritten(tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/thesis.tex").write_text("x")
     with pytest.raises(TopolocError, match=r"is not empty and has thesis\.tex"):

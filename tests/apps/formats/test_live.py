@@ -42,7 +42,7 @@ def greys(num_pictures: int) -> list[np.ndarray]:
         ("session1@0:10", False),
     ],
 )
-def test_what_is_a_live_source(source: str, live: bool):
+def test_addresses_of_live_sources(source: str, live: bool):
     assert is_live(source) is live
 
 
@@ -95,7 +95,7 @@ def test_stopped_from_outside():
 @pytest.mark.parametrize(
     "source", ["rtsp://127.0.0.1:9/none", "http://127.0.0.1:9/none.mjpg", "/dev/video99", "997"]
 )
-def test_what_does_not_answer(source: str, capfd: pytest.CaptureFixture[str]):
+def test_a_source_without_an_answer_is_an_error(source: str, capfd: pytest.CaptureFixture[str]):
     with pytest.raises(RecordingError, match="does not answer"):
         LiveSource(source, stall_s=2.0)
     assert capfd.readouterr().err == ""

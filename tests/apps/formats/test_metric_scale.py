@@ -52,7 +52,7 @@ def test_a_unit_in_metres(texts: tuple[str, ...], scale: float):
         (("big",), "a scale is a positive number"),
     ],
 )
-def test_what_makes_none(texts: tuple[str, ...], said: str):
+def test_invalid_scales_are_refused(texts: tuple[str, ...], said: str):
     with pytest.raises(TrajectoryError) as error:
         estimate_metric_scale(texts, MODEL)
     assert said in str(error.value)

@@ -16,7 +16,7 @@ from topoloc.errors import CalibrationError, RecordingError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import find_format, open_sequence
 
-# The columns of nerfstudio's matrix are right, up and back; ours are right, down and forward.
+# The columns of Nerfstudio's matrix are right, up and back. Ours are right, down and forward.
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 LENS: dict[str, Any] = {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "fl_y": 41.0, "cx": 16.0, "cy": 12.0}
 Make = Callable[..., Path]
@@ -92,7 +92,7 @@ def test_axes_camera_order_and_depth(capture: Make):
     np.testing.assert_allclose(frame.depth.depth[1:], 10.0, rtol=1e-6)
 
 
-def test_a_point_in_front_of_the_camera_is_where_the_matrix_says(capture: Make):
+def test_a_point_in_front_of_the_camera_agrees_with_the_matrix(capture: Make):
     folder = capture(
         lambda data: data["frames"].__setitem__(
             0, data["frames"][0] | {"transform_matrix": np.eye(4).tolist()}
@@ -250,7 +250,7 @@ def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
         ),
     ],
 )
-def test_what_is_refused(
+def test_invalid_files_are_refused(
     capture: Make, change: Callable[[dict[str, Any]], None], error: type[TopolocError], says: str
 ):
     with pytest.raises(error, match=says) as raised:
@@ -269,7 +269,7 @@ def test_files_that_are_no_json(tmp_path: Path, text: str):
         open_sequence(tmp_path)
 
 
-def test_a_picture_with_a_name_that_no_disk_holds_is_missing(capture: Make):
+def test_an_image_with_an_impossible_name_is_missing(capture: Make):
     folder = capture(
         lambda data: data["frames"][1].update(file_path="images/" + "9" * 5000), depth_scale=None
     )

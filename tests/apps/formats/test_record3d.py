@@ -162,7 +162,7 @@ def test_without_the_extra(export: Make, monkeypatch: pytest.MonkeyPatch):
         ({"frameTimestamps": [1.0]}, RecordingError, "1 frameTimestamps for 3 images"),
     ],
 )
-def test_what_is_refused(
+def test_invalid_exports_are_refused(
     export: Make, changes: dict[str, Any], error: type[TopolocError], says: str
 ):
     with pytest.raises(error, match=says):

@@ -111,7 +111,7 @@ def test_two_cameras_in_camera_json(pairs: Path):
         open_sequence(pairs)
 
 
-def test_what_opencv_writes(pairs: Path):
+def test_yaml_written_by_opencv(pairs: Path):
     write_opencv(pairs / "stereo.yml")
     _assert_rig(open_sequence(pairs)[0], LEFT, RIGHT)
 
@@ -283,7 +283,7 @@ class TestCameraOption:
         )
         np.testing.assert_allclose(frame.depth.depth, 0.2, rtol=1e-6)
 
-    def test_what_is_said_nowhere_is_asked_for(self, plain: Callable[..., Path]):
+    def test_a_missing_value_is_named(self, plain: Callable[..., Path]):
         with pytest.raises(CalibrationError, match="depth_factor"):
             open_sequence(plain("rgb", "depth"), camera="45,46,16,12")
         with pytest.raises(CalibrationError, match="baseline"):
@@ -304,7 +304,7 @@ class TestCameraOption:
             == Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
         )  # pyright: ignore[reportOptionalMemberAccess]
 
-    def test_a_kind_that_keeps_its_own_depth_camera(self, seven_scenes: Path):
+    def test_a_format_that_keeps_its_own_depth_camera(self, seven_scenes: Path):
         frame = open_sequence(seven_scenes, camera="520,520,320,240")[0]
         assert frame.depth is not None
         assert (frame.camera and frame.camera.fx, frame.depth.camera.fx) == (520, 585)
@@ -328,13 +328,13 @@ class TestCameraOption:
         with pytest.raises(CalibrationError, match=says):
             open_sequence(kitti, camera=numbers)
 
-    def test_a_principal_point_somewhat_off_is_believed(self, kitti: Path):
+    def test_a_principal_point_somewhat_off_is_accepted(self, kitti: Path):
         assert open_sequence(kitti, camera="45,46,18,10.5")[0].camera == Camera.pinhole(
             WIDTH, HEIGHT, 45.0, 46.0, 18.0, 10.5
         )
 
 
-def test_a_distorted_pair_is_rectified_to_what_the_calibration_says():
+def test_a_distorted_pair_is_rectified_as_its_calibration():
     """Rectified cameras see a point of the raw cameras in equal rows, at the
     disparity of its depth."""
     from topoloc.geometry.rig import rectify

@@ -98,7 +98,7 @@ def replace(name: str, old: str, new: str) -> Callable[[Path], None]:
         (lambda folder: (folder / "rgb.mp4").unlink(), RecordingError, r"rgb\.mp4"),
     ],
 )
-def test_what_is_malformed(
+def test_malformed_folders_are_refused(
     folder: Path, change: Callable[[Path], None], error: type[TopolocError], says: str
 ):
     change(folder)

@@ -94,7 +94,9 @@ def sdk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyzed.sl", sl)
 
 
-def test_without_the_sdk_it_is_said_how_to_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_the_sdk_the_error_names_the_export(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "pyzed", None)
     path = tmp_path / "walk.svo2"
     path.write_bytes(b"svo")

@@ -25,7 +25,7 @@ def localizer(room_map: Path) -> Localizer:
     return Localizer(TopoMetricMap.load(room_map))
 
 
-def test_an_answer_is_among_what_was_tried(localizer: Localizer, queries: Path):
+def test_a_reported_pose_is_among_the_tried_ones(localizer: Localizer, queries: Path):
     frame = open_sequence(queries)[0]
     explanation = explain(localizer, frame.image, frame.camera)
     assert explanation.result.localized
@@ -36,7 +36,7 @@ def test_an_answer_is_among_what_was_tried(localizer: Localizer, queries: Path):
     assert explanation.num_features["surf"] == len(best.tried.fit.features)
 
 
-def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):
+def test_proposals_of_an_earlier_pose_are_marked(localizer: Localizer):
     """If no evidence suffices, each similar place is tried and leads to the same pose."""
     weights = load_fitted_weights("surf")
     weights = replace(weights, evidence=structs.replace(weights.evidence, clear_log_odds=1e9))
@@ -50,7 +50,7 @@ def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):
     assert verdicts.count("the answer") == len(unseen_views())
 
 
-def test_a_dark_blank_picture_is_called_so(localizer: Localizer, queries: Path):
+def test_a_dark_blank_image_is_described(localizer: Localizer, queries: Path):
     frame = open_sequence(queries)[0]
     assert frame.camera is not None
     dark = np.random.default_rng(0).integers(0, 4, frame.image.shape, dtype=np.uint8)
@@ -60,7 +60,7 @@ def test_a_dark_blank_picture_is_called_so(localizer: Localizer, queries: Path):
     assert any("darker than any session" in line for line in explanation.advice)
 
 
-def test_a_wrong_calibration_is_said(localizer: Localizer, queries: Path):
+def test_a_wrong_calibration_is_reported(localizer: Localizer, queries: Path):
     frame = open_sequence(queries)[0]
     assert frame.camera is not None
     wrong = type(frame.camera).pinhole(

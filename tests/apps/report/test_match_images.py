@@ -60,7 +60,7 @@ def test_matches_of_a_localized_query_are_those_that_its_pose_explains(topomap: 
     assert np.median(_seen_in_node(topomap, result.node_id, matches, truth)) < 1.0
 
 
-def test_without_a_pose_the_truth_tells_right_from_wrong(topomap: TopoMetricMap):
+def test_without_a_pose_the_truth_labels_the_matches(topomap: TopoMetricMap):
     picture, truth = unseen_views()[2]
     matcher = NodeMatcher(topomap.nodes[2], topomap.config.features)
     known = match_with_node(
@@ -71,7 +71,7 @@ def test_without_a_pose_the_truth_tells_right_from_wrong(topomap: TopoMetricMap)
     )
     off = _seen_in_node(topomap, 2, known, truth)
     assert known.is_inlier.any()
-    np.testing.assert_array_equal(known.is_inlier, off <= 4.0)  # 8 px in a picture of 640
+    np.testing.assert_array_equal(known.is_inlier, off <= 4.0)  # 8 px in an image of 640
     unknown = match_with_node(
         EvaluatedQuery("q", NotLocalized("not_in_map"), None),
         picture,

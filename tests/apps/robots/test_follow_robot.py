@@ -84,7 +84,7 @@ def test_tf_is_right_through_wrong_images_darkness_and_a_kidnapping(
     before, after = robot.errors(0, kidnapped - 1), robot.errors(kidnapped, len(steps) - 2)
     assert np.median(before) < 0.02
     assert before.max() < 0.3
-    assert after[:10].max() > 1.0  # nobody can know
+    assert after[:10].max() > 1.0  # the robot cannot detect it at once
     assert after[-50:].max() < 0.05
     poses = robot.pose_errors()
     assert len(poses) > 30
@@ -93,7 +93,7 @@ def test_tf_is_right_through_wrong_images_darkness_and_a_kidnapping(
     assert robot.gaps().max() < 1.0
     assert np.median(robot.latencies()) < 1.0
     assert _levels(robot, (5, 18)) == {0}
-    assert 1 in _levels(robot, (dark + 8, light + 5))  # WARN, seconds are those of a busy machine
+    assert 1 in _levels(robot, (dark + 8, light + 5))  # WARN, with slack for a busy machine
     assert robot.heard.statuses[-1][1] == 0
 
 

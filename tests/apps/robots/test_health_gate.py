@@ -77,7 +77,7 @@ def test_wrong_places_do_not_move_it(gate: HealthGate):
     assert not gate.is_contradicted
 
 
-def test_a_jump_is_believed_after_a_second_of_images_that_agree(gate: HealthGate):
+def test_a_jump_is_accepted_after_a_second_of_agreeing_images(gate: HealthGate):
     verdicts = _verdicts(gate, [_evidence(1.0 + 0.1 * k, AWAY) for k in range(13)])
     assert verdicts == "d" * 10 + "jff"
     assert gate.agreed is not None
@@ -102,7 +102,7 @@ def test_images_that_odometry_contradicts_confirm_no_jump(gate: HealthGate):
     assert set(_verdicts(gate, sliding)) == {"d"}
 
 
-def test_after_a_long_way_in_the_dark_the_drift_is_no_jump(gate: HealthGate):
+def test_after_a_long_path_in_the_dark_the_drift_is_no_jump(gate: HealthGate):
     """After 20 metres with a drift of five per cent, one metre is one sigma."""
     assert _verdicts(gate, [_evidence(40.0, drift=1.0)]) == "f"
     assert _verdicts(HealthGate(), [_evidence(40.0, drift=1.0)]) == "d"

@@ -196,11 +196,11 @@ def test_poses_are_sent_and_jumps_are_counted():
     assert frames == expected
 
 
-def test_the_own_port_answers_who_wrote_to_it():
+def test_an_own_port_sends_to_its_clients():
     with _receiver() as free:
         port = free.getsockname()[1]
     publisher = MavlinkPublisher(f"udpin:127.0.0.1:{port}")
-    publisher.publish(0, Rigid3.identity(), _NONE, 0.9)  # nobody is there yet
+    publisher.publish(0, Rigid3.identity(), _NONE, 0.9)  # no receiver is connected yet
     with _receiver() as receiver:
         receiver.sendto(b"\xfd", ("127.0.0.1", port))
         publisher.publish(1000, Rigid3.identity(), _NONE, 0.9)
@@ -215,7 +215,7 @@ def test_the_own_port_answers_who_wrote_to_it():
     ["", "udpout", "udpout:localhost", "udpout:localhost:0", "udpout:localhost:70000",
      "udpout::14550", "tcp:localhost:5760", "udpout:localhost:14550x", "udpout:a:b:14550"],
 )  # fmt: skip
-def test_what_is_no_address_is_said_in_a_sentence(address: str):
+def test_an_invalid_address_is_one_sentence(address: str):
     with pytest.raises(TopolocError, match="a MAVLink address is udpout:HOST:PORT or udpin"):
         MavlinkPublisher(address)
 
@@ -269,7 +269,7 @@ def test_a_pose_is_repeated_while_it_is_new():
     assert {t_us for t_us, *_ in found} == {0}
 
 
-def test_follow_sends_what_it_localizes(room_map: Path, tiny_recording: Path):
+def test_follow_sends_localized_poses(room_map: Path, tiny_recording: Path):
     sequence = open_sequence(tiny_recording)
     with _receiver() as receiver:
         address = f"udpout:127.0.0.1:{receiver.getsockname()[1]}"

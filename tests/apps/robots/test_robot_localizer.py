@@ -170,7 +170,7 @@ def test_map_to_odom_is_that_of_the_measured_poses(make: Callable[..., Robot]):
     assert np.allclose(pose.matrix(), MAP_FROM_ODOM.matrix(), atol=1e-9)
     assert 0.0 < (t_ns - time.time_ns()) / 1e9 <= 0.2  # ahead
     poses = [pose for _, pose in robot.published.poses]
-    assert len(poses) == 3  # the third of those that agree, and later ones
+    assert len(poses) == 3  # the third agreeing pose, and later ones
     expected = MAP_FROM_ODOM @ robot.base(4)
     assert np.allclose(poses[-1].matrix(), expected.matrix(), atol=1e-9)
     assert robot.warnings == []
@@ -186,7 +186,7 @@ def test_it_is_published_between_the_images_with_stamps_that_increase(make: Call
     assert np.diff(stamps).min() > 0
 
 
-def test_what_is_no_evidence_is_not_published(make: Callable[..., Robot]):
+def test_poses_without_evidence_are_not_published(make: Callable[..., Robot]):
     """The gate ignores predicted poses, low probabilities, repeated images and tracked points at
     another place."""
     robot = make()
@@ -365,6 +365,6 @@ def test_without_odometry_a_jump_is_published_once_three_images_agree(make: Call
     assert num_published == [0, 0, 1, 2, 2, 3, 3, 3, 4]
 
 
-def test_an_initial_pose_is_published_or_heard(make: Callable[..., Robot]):
+def test_an_initial_pose_is_published_or_received(make: Callable[..., Robot]):
     assert "initialpose" in make().node.heard
     assert "initialpose" not in make(publish_initial_pose=True).node.heard

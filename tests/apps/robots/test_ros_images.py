@@ -187,6 +187,6 @@ def test_missing_messages_are_named(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("topic", ["", "/", "/a b", "/camera//image", "/1st", "/a" * 3 + "/"])
-def test_what_is_no_topic_is_refused(topic: str):
+def test_an_invalid_topic_is_refused(topic: str):
     with pytest.raises(RecordingError, match="no topic of ROS"):
         RosImages(Node(), f"ros:{topic}", True, print)

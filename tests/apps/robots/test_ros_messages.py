@@ -97,7 +97,7 @@ def test_a_domain_that_there_is_not_is_refused(monkeypatch: pytest.MonkeyPatch):
     node.close()
 
 
-def test_without_a_network_one_sentence_says_so(monkeypatch: pytest.MonkeyPatch):
+def test_without_a_network_the_error_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
     interface = '<Interfaces><NetworkInterface name="nope0"/></Interfaces>'
     monkeypatch.setenv(
         "CYCLONEDDS_URI",

@@ -35,7 +35,7 @@ def parameters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         del sys.modules[name]
 
 
-def test_what_is_installed_is_there(monkeypatch: pytest.MonkeyPatch):
+def test_installed_files_exist(monkeypatch: pytest.MonkeyPatch):
     given: dict[str, Any] = {}
     monkeypatch.setattr("setuptools.setup", lambda **settings: given.update(settings))
     monkeypatch.chdir(PACKAGE)
@@ -52,7 +52,7 @@ def test_what_is_installed_is_there(monkeypatch: pytest.MonkeyPatch):
     assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
-def test_what_the_code_imports_is_depended_on():
+def test_imported_packages_are_dependencies():
     root = ElementTree.parse(PACKAGE / "package.xml").getroot()
     assert root.findtext("name") == PACKAGE.name
     depends = {one.text for one in root.iter("exec_depend")}

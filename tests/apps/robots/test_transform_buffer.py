@@ -69,7 +69,7 @@ def test_it_waits_no_longer_than_it_may(buffer: TransformBuffer):
     assert 0.2 <= time.monotonic() - since < 5.0
 
 
-def test_what_is_missing_is_named(buffer: TransformBuffer):
+def test_missing_frames_are_named(buffer: TransformBuffer):
     with pytest.raises(TransformError, match="no frame lens in TF; TF has base, camera"):
         buffer.look_up("odom", "lens", SECOND)
     with pytest.raises(TransformError, match="TF is empty"):

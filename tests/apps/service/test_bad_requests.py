@@ -84,13 +84,13 @@ def _check(answer: httpx.Response, status: int) -> str:
 
 
 @pytest.mark.parametrize("kind", FEATURE_TYPES)
-def test_pictures_that_are_none(client: httpx.Client, view: Path, kind: str):
+def test_invalid_images_are_refused(client: httpx.Client, view: Path, kind: str):
     data, status = _pictures(view)[kind]
     _check(client.post(LOCALIZE, files={"image": ("picture.jpg", data)}), status)
     _check(client.post(LOCALIZE, content=data, headers={"content-type": "image/jpeg"}), status)
 
 
-def test_who_sends_too_much_slowly_reads_why_all_the_same(service: Running):
+def test_a_slow_client_that_sends_too_much_gets_the_reason(service: Running):
     """If the server closes a connection while the client sends, TCP resets it, and
     unread data is lost."""
     address, part = urlsplit(service.url), bytes(32_000)
@@ -133,7 +133,7 @@ def test_who_sends_too_much_slowly_reads_why_all_the_same(service: Running):
     ],
     ids=lambda camera: camera[:40],
 )
-def test_cameras_that_are_none(client: httpx.Client, view: Path, camera: str):
+def test_invalid_cameras_are_refused(client: httpx.Client, view: Path, camera: str):
     _check(client.post(LOCALIZE, files={"image": view.open("rb")}, data={"camera": camera}), 422)
 
 
@@ -149,7 +149,7 @@ def test_cameras_that_are_none(client: httpx.Client, view: Path, camera: str):
     ],
     ids=str,
 )
-def test_what_makes_no_sense_is_refused(client: httpx.Client, view: Path, said: dict[str, str]):
+def test_invalid_values_are_refused(client: httpx.Client, view: Path, said: dict[str, str]):
     _check(client.post(LOCALIZE, files={"image": view.open("rb")}, data=said), 422)
     _check(
         client.post(
@@ -159,7 +159,7 @@ def test_what_makes_no_sense_is_refused(client: httpx.Client, view: Path, said: 
     )
 
 
-def test_forms_that_are_none(client: httpx.Client, view: Path):
+def test_invalid_forms_are_refused(client: httpx.Client, view: Path):
     _check(client.post(LOCALIZE, files={"picture": view.open("rb")}), 400)
     _check(client.post(LOCALIZE, data={"image": "text"}), 415)
     _check(
@@ -179,7 +179,7 @@ def test_forms_that_are_none(client: httpx.Client, view: Path):
     _check(client.post(LOCALIZE, files=many), 400)
 
 
-def test_what_is_not_there(client: httpx.Client, view: Path):
+def test_missing_routes_and_maps_are_refused(client: httpx.Client, view: Path):
     _check(client.post("/v1/maps/nowhere/localize", files={"image": view.open("rb")}), 404)
     _check(
         client.post("/v1/maps/..%2F..%2Fetc%2Fpasswd/localize", files={"image": view.open("rb")}),
@@ -200,7 +200,7 @@ def test_other_sites_and_other_names_are_not_answered(client: httpx.Client):
     assert "access-control-allow-origin" not in client.get("/v1/maps").headers
 
 
-def test_a_client_that_sends_slowly_is_ended_and_blocks_nobody(
+def test_a_slow_client_is_disconnected_and_blocks_no_other(
     service: Running, client: httpx.Client, view: Path, camera: str
 ):
     address = urlsplit(service.url)
@@ -229,7 +229,7 @@ def test_a_client_that_sends_slowly_is_ended_and_blocks_nobody(
             one.close()
 
 
-def test_a_client_that_goes_away_harms_nobody(service: Running, client: httpx.Client):
+def test_a_client_that_goes_away_affects_no_other(service: Running, client: httpx.Client):
     address = urlsplit(service.url)
     assert address.hostname
     with socket.create_connection((address.hostname, address.port or 80), 10.0) as gone:
@@ -240,7 +240,7 @@ def test_a_client_that_goes_away_harms_nobody(service: Running, client: httpx.Cl
     assert not any('"level": "error"' in line for line in service.log)
 
 
-def test_too_many_at_a_time_are_told_when_to_come_again(service: Running, view: Path, camera: str):
+def test_too_many_requests_at_once_get_a_time_to_retry(service: Running, view: Path, camera: str):
     """Up to 34 requests run or wait. Of 60 at once, some get a time to retry, and all
     others a pose."""
     data = view.read_bytes()

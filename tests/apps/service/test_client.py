@@ -45,7 +45,7 @@ def test_results_are_those_of_a_localizer(service: Running, maps: Path, view: Pa
         assert client.explain("room", view, calibration)["tried"]
 
 
-def test_all_maps_are_asked_and_a_damaged_one_is_named(service: Running, view: Path, camera: str):
+def test_all_maps_are_queried_and_a_damaged_one_is_named(service: Running, view: Path, camera: str):
     with Client(service.url) as client:
         answer = client.localize_everywhere(view, Camera.from_json(json.loads(camera)))
     assert {row["map"] for row in answer["answers"]} == {"earth", "room"}
@@ -69,7 +69,7 @@ def test_the_same_in_an_event_loop(service: Running, view: Path, camera: str):
     assert asyncio.run(ask()) == [True] * 5
 
 
-def test_what_goes_wrong_is_one_line(service: Running, view: Path):
+def test_errors_are_one_line(service: Running, view: Path):
     with Client(service.url) as client:
         with pytest.raises(ServiceError, match="no map 'nowhere'") as refused:
             client.localize("nowhere", view)

@@ -169,7 +169,7 @@ def test_messages_that_nobody_reads_the_answers_of_leave_no_memory(service: Runn
 
 
 @pytest.mark.parametrize("is_gone", [False, True])
-def test_a_job_that_nobody_waits_for_gives_its_place_to_the_next(is_gone: bool):
+def test_an_abandoned_job_gives_its_place_to_the_next(is_gone: bool):
     release = threading.Event()
 
     async def receive() -> dict[str, str]:
@@ -219,7 +219,7 @@ def test_a_search_that_nobody_waits_for_is_stopped(is_gone: bool):
     asyncio.run(ask())
 
 
-def test_a_scene_that_nobody_waits_for_is_not_made(room_map: Path):
+def test_an_abandoned_scene_is_not_made(room_map: Path):
     stop = threading.Event()
     service = _service_of([str(room_map)], ServiceConfig())
     with closing(service.maps):

@@ -27,7 +27,7 @@ def _preflight(client: httpx.Client, path: str, method: str, **headers: str) -> 
     return client.options(path, headers=asked | headers)
 
 
-def test_a_page_of_an_allowed_origin_asks_by_the_geopose_protocol(
+def test_a_page_of_an_allowed_origin_uses_the_geopose_protocol(
     asked: httpx.Client, view: Path, camera: str
 ):
     allowed = _preflight(
@@ -143,9 +143,7 @@ def test_any_origin_needs_a_token(complaint: Callable[..., str], maps: Path, tmp
     ["", "app.example", "null", "https://app.example/page", "https://app.example/", "https://",
      "https://*.example", "https://me@app.example", "https://app.example:x", "https://a.b?c"],
 )  # fmt: skip
-def test_what_is_no_origin_is_said_in_one_line(
-    complaint: Callable[..., str], maps: Path, text: str
-):
+def test_an_invalid_origin_is_one_line(complaint: Callable[..., str], maps: Path, text: str):
     said = complaint("serve", maps, "--allow-origin", text, status=2)
     assert "https://app.example, without a path" in said
 

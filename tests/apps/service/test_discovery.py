@@ -85,7 +85,7 @@ def test_a_search_finds_the_map_and_the_address_of_its_service(
     ],
     ids=str,
 )
-def test_who_searches_here_finds_it(asked: httpx.Client, query: dict[str, Any]):
+def test_a_search_in_the_area_finds_the_service(asked: httpx.Client, query: dict[str, Any]):
     assert [one["service"]["service_id"] for one in _search(asked, **query)] == ["earth"]
 
 
@@ -102,7 +102,7 @@ def test_who_searches_here_finds_it(asked: httpx.Client, query: dict[str, Any]):
     ],
     ids=str,
 )  # fmt: skip
-def test_who_searches_elsewhere_or_another_service_does_not(
+def test_a_search_elsewhere_or_of_another_service_finds_nothing(
     asked: httpx.Client, query: dict[str, Any]
 ):
     assert _search(asked, **query) == []
@@ -138,7 +138,7 @@ def test_a_search_that_is_no_json_is_a_400(asked: httpx.Client, body: bytes):
     assert asked.post(SEARCH, content=body).status_code == 400
 
 
-def test_the_short_form_says_the_same(asked: httpx.Client):
+def test_the_short_form_has_the_same_content(asked: httpx.Client):
     (by_post,) = _search(asked, geohash="u15")
     by_get = asked.get(SEARCH, params={"geohash": "u15", "kind": "VPS"})
     assert [one["id"] for one in by_get.json()["results"]] == [by_post["id"]]

@@ -36,7 +36,7 @@ def _run(program: str, *args: object, **environment: str) -> str:
     return done.stdout
 
 
-def test_it_asks_a_service(open_service: Running, view: Path, camera: str):
+def test_it_queries_a_service(open_service: Running, view: Path, camera: str):
     printed = _run(
         "node",
         "--experimental-websocket",
@@ -63,9 +63,7 @@ _IN_A_PAGE = """async ([url, token, base64]) => {
 }"""
 
 
-def test_a_page_of_another_origin_asks_with_a_token(
-    maps: Path, site: str, view: Path, tmp_path: Path
-):
+def test_a_page_of_another_origin_sends_a_token(maps: Path, site: str, view: Path, tmp_path: Path):
     (tmp_path / "token").write_text(SIGNED_TOKEN)
     options = ("--token-file", tmp_path / "token", "--allow-origin", site)
     image = base64.b64encode(view.read_bytes()).decode()

@@ -86,12 +86,12 @@ def test_the_code_holds_the_link():
     assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == link
 
 
-def test_what_does_not_go_together_is_said(complaint: Callable[..., str], room_map: Path):
+def test_contradicting_options_are_an_error(complaint: Callable[..., str], room_map: Path):
     assert "--behind-proxy" in complaint("serve", room_map, "--lan", "--behind-proxy", status=2)
     assert "--tls-key" in complaint("serve", room_map, "--lan", "--tls-cert", "c.pem", status=2)
 
 
-def test_without_a_network_a_host_is_asked_for(monkeypatch: pytest.MonkeyPatch):
+def test_without_a_network_a_host_is_required(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(lan.socket, "socket", _raise)
     monkeypatch.setattr(lan.socket, "gethostbyname_ex", lambda _: ("", [], ["127.0.1.1"]))
     with pytest.raises(lan.TopolocError, match="--host"):

@@ -84,7 +84,7 @@ def test_cameras_by_their_names(client: httpx.Client, view: Path, camera: str, c
         assert answer["camera"] == pytest.approx(named) if "baseline" not in named else True
 
 
-def test_a_prior_and_a_time_limit_are_heard(
+def test_a_prior_and_a_time_limit_are_used(
     client: httpx.Client, queries: Path, view: Path, camera: str
 ):
     pose = Trajectory.read(queries / "truth.tum").world_from_cam[2]
@@ -100,7 +100,7 @@ def test_a_prior_and_a_time_limit_are_heard(
     assert "coarse" not in answer.json()["times_ms"]
 
 
-def test_a_picture_of_elsewhere_is_an_answer(client: httpx.Client, camera: str, tmp_path: Path):
+def test_an_out_of_map_image_is_a_result(client: httpx.Client, camera: str, tmp_path: Path):
     import cv2
 
     noise = np.random.default_rng(3).integers(0, 255, (240, 320), dtype=np.uint8)
@@ -127,7 +127,7 @@ def test_maps_are_described(client: httpx.Client, maps: Path):
     assert client.get("/capabilities").json()["maps"] == ["damaged", "earth", "room"]
 
 
-def test_why(client: httpx.Client, view: Path, camera: str):
+def test_the_explanation_of_a_query(client: httpx.Client, view: Path, camera: str):
     as_json = client.post(
         "/v1/maps/room/explain", files={"image": view.open("rb")}, data={"camera": camera}
     )
@@ -142,7 +142,7 @@ def test_why(client: httpx.Client, view: Path, camera: str):
     assert "What was tried" in page.text
 
 
-def test_a_damaged_map_is_a_503_for_those_who_ask_it_and_nothing_to_others(
+def test_a_damaged_map_is_a_503_and_affects_no_other_map(
     client: httpx.Client, view: Path, camera: str
 ):
     data = {"camera": camera}
@@ -181,7 +181,7 @@ def test_metrics_count_answers(client: httpx.Client, view: Path, camera: str):
     assert localized() == before + 1
 
 
-def test_a_map_replaced_on_disk_is_asked_next(
+def test_a_map_replaced_on_disk_is_used_next(
     client: httpx.Client, maps: Path, view: Path, camera: str
 ):
     shutil.copy(maps / "room.topo", maps / "changing.topo")

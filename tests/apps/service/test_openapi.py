@@ -65,7 +65,7 @@ def _validate(document: dict[str, Any], name: str, answer: Any) -> None:
     jsonschema.Draft202012Validator(root).validate(answer)
 
 
-def test_every_route_says_what_it_answers_and_refuses(document: dict[str, Any]):
+def test_every_route_documents_its_answers_and_errors(document: dict[str, Any]):
     for name, operation in _operations(document):
         assert operation["description"], name
         good = [one for status, one in operation["responses"].items() if status.startswith("2")]

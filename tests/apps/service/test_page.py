@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(
 )
 NOTHING = SHIPPED / "pictures_of_nothing" / "black.png"
 ANSWERED = "#answer h2.good, #answer h2.bad"
-# As if a picture were dropped on the page, or pasted.
+# Drop an image on the page, or paste it.
 BROUGHT = """([how, name, base64]) => {
   const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
   const data = new DataTransfer();
@@ -98,7 +98,7 @@ def _frustum(page: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("how", "width"), [("drop", 1300), ("paste", 400), ("choose", 400)])
-def test_a_picture_shows_where_it_was_taken(browser: Any, lab: Lab, how: str, width: int):
+def test_an_image_shows_its_pose(browser: Any, lab: Lab, how: str, width: int):
     with opened(browser, f"{lab.service.url}/", width) as page:
         _bring(page, lab, how)
         assert np.linalg.norm(_frustum(page) - lab.true.translation) < 0.01
@@ -255,7 +255,7 @@ def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):
             page.keyboard.press("Enter")
 
 
-def test_a_live_stream_draws_the_way(lab: Lab, browser: Any):
+def test_a_live_stream_draws_the_path(lab: Lab, browser: Any):
     """A canvas with the image replaces the browser's camera."""
     with opened(browser, f"{lab.service.url}/", 1300) as page:
         page.wait_for_selector("#scene canvas")
@@ -290,7 +290,7 @@ def test_a_live_stream_draws_the_way(lab: Lab, browser: Any):
         assert page.inner_text("#answer h2").startswith("Here, at")
 
 
-def test_the_token_is_asked_for(room_map: Path, tmp_path: Path, browser: Any):
+def test_the_token_is_requested(room_map: Path, tmp_path: Path, browser: Any):
     (tmp_path / "token").write_text(TOKEN)
     with running(room_map, "--token-file", tmp_path / "token") as service:
         page = browser.new_page()
@@ -340,7 +340,7 @@ def test_a_map_that_grows_is_drawn_again_seen_as_before(browser: Any, lab: Lab):
         page.keyboard.press("Tab")
         page.locator("#scene canvas").press("ArrowLeft")
         seen_from = page.evaluate(view)
-        page.wait_for_timeout(3500)  # the page has asked once
+        page.wait_for_timeout(3500)  # the page has polled once
         more.save(growing)
         for _ in range(200):
             if page.evaluate(nodes) != before:

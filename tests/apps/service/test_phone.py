@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(
 )
 FRAMES = (3, 4, 5)
 SIGHT = "document.querySelector('[data-part=sight]').sight"
-# What is drawn now: the image of the last answer, its place on the canvas, and points with pixels.
+# The overlay: the image of the last result, its place on the canvas, and points with pixels.
 DRAWN = f"""() => {{
   const sight = {SIGHT};
   if (!sight.seen) return null;
@@ -150,7 +150,7 @@ def test_the_map_lies_over_the_image_where_truth_puts_it(phone: Phone, size: tup
         assert page.locator("#view video").evaluate("(video) => video.srcObject") is None
 
 
-def test_requests_carry_the_stream_where_a_websocket_fails(phone: Phone):
+def test_requests_carry_the_stream_if_a_websocket_fails(phone: Phone):
     with live(phone, NO_SOCKET) as page, phone.service.client() as client:
         _wait(page, f"{SIGHT}.seen !== null")
         assert "topoloc_streams 1.0" in client.get("/metrics").text
@@ -236,7 +236,7 @@ def test_the_motion_sensor_is_read_in_every_position_of_the_screen(phone: Phone)
           });
         }"""  # noqa: E501
     )
-    # rows of east, north, up; columns of right, down, forward
+    # rows: east, north, up. Columns: right, down, forward
     for one in seen:
         np.testing.assert_allclose(one, [1, 0, 0, 0, 0, 1, 0, -1, 0], atol=1e-9)
     page.close()
@@ -251,7 +251,7 @@ def test_the_motion_sensor_is_read_in_every_position_of_the_screen(phone: Phone)
     ],
     ids=["no permission", "no HTTPS", "no sensor"],
 )
-def test_what_the_device_does_not_give_is_said_in_a_sentence(phone: Phone, script: str, said: str):
+def test_a_missing_device_feature_is_one_sentence(phone: Phone, script: str, said: str):
     with live(phone, script) as page:
         page.get_by_text(said).wait_for()
 

@@ -23,7 +23,7 @@ from topoloc.apps.service.ray_serve import ProxyOptions, _create_deployment
 Complaint = Callable[..., str]
 
 
-def test_what_makes_no_sense(maps: Path, complaint: Complaint):
+def test_invalid_options_are_refused(maps: Path, complaint: Complaint):
     assert "--replicas belongs to --ray" in complaint("serve", maps, "--replicas", 2, status=2)
     assert "--port 0" in complaint("serve", maps, "--ray", "local", "--port", 0, status=2)
     for replicas in ("many", "3-", "4-2", "0"):

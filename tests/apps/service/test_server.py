@@ -35,12 +35,12 @@ def test_elsewhere_only_with_a_token_and_tls_or_a_proxy(
     assert "at least 16" in complaint("serve", maps, "--token-file", token)
 
 
-def test_a_port_in_use_is_said_in_one_line(complaint: Callable[..., str], maps: Path):
+def test_a_port_in_use_is_one_line(complaint: Callable[..., str], maps: Path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         assert "cannot listen" in complaint("serve", maps, "--port", taken.getsockname()[1])
 
 
-def test_only_those_with_the_token_are_answered(maps: Path, view: Path, tmp_path: Path):
+def test_only_requests_with_the_token_are_answered(maps: Path, view: Path, tmp_path: Path):
     (tmp_path / "token").write_text(TOKEN + "\n")
     with (
         running(maps / "room.topo", "--token-file", tmp_path / "token") as service,
@@ -74,9 +74,7 @@ def test_only_those_with_the_token_are_answered(maps: Path, view: Path, tmp_path
         assert TOKEN not in "".join(service.log)
 
 
-def test_requests_in_progress_are_finished_when_it_is_told_to_end(
-    maps: Path, queries: Path, camera: str
-):
+def test_requests_in_progress_are_finished_at_shutdown(maps: Path, queries: Path, camera: str):
     """Sixteen requests wait when the signal arrives. Each gets its answer, and the
     process exits with 0."""
     asked = {"files": {"image": (queries / "view02.png").read_bytes()}, "data": {"camera": camera}}
@@ -106,7 +104,7 @@ def test_requests_in_progress_are_finished_when_it_is_told_to_end(
         assert json.loads(service.log[-1])["event"] == "ended"
 
 
-def test_a_connection_that_says_nothing_is_closed(service: object, client: httpx.Client):
+def test_an_idle_connection_is_closed(service: object, client: httpx.Client):
     address = urlsplit(str(client.base_url))
     assert address.hostname
     with socket.create_connection((address.hostname, address.port or 80), 30.0) as silent:

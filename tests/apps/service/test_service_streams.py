@@ -157,7 +157,7 @@ async def _close_during_a_job(port: int, is_socket: bool, picture: bytes, begun:
 
 
 @pytest.mark.parametrize("is_socket", [False, True])
-def test_a_search_whose_client_has_gone_is_stopped(
+def test_the_search_of_a_disconnected_client_is_stopped(
     room_map: Path, view: Path, monkeypatch: pytest.MonkeyPatch, is_socket: bool
 ):
     begun, ended, process = threading.Event(), threading.Event(), Tracker.process

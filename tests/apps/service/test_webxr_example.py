@@ -21,7 +21,7 @@ from topoloc.geometry.rigid import Rigid3
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 
-# A session whose camera sees one picture. `window.drawn`: the pixels of the axes, from the bottom.
+# A session whose camera sees one image. `window.drawn`: the pixels of the axes, from the bottom.
 SESSION = """(([image, projection, pose, inverse]) => {
   const picture = new Image();
   picture.src = image;
@@ -89,7 +89,7 @@ def _example(browser: Any, site: str, script: str = "") -> Iterator[Any]:
     page.close()
 
 
-def test_it_loads_and_says_what_is_missing(browser: Any, site: str):
+def test_it_loads_and_names_missing_features(browser: Any, site: str):
     with _example(browser, site) as page:
         page.wait_for_function("!support.textContent.startsWith('Looking')")
         assert "choose a picture" in page.inner_text("#support").lower()

@@ -35,9 +35,7 @@ def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     listener.close()
 
 
-def test_a_store_that_says_nothing_is_given_up(
-    silent: str, room_map: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_silent_store_times_out(silent: str, room_map: Path, capsys: pytest.CaptureFixture[str]):
     start = time.monotonic()
     for args in (["info", silent], ["add", silent, str(room_map)]):
         assert main(["atlas", *args]) == 1
@@ -68,7 +66,7 @@ def test_pictures_are_localized_in_an_atlas_on_s3(s3_bucket: str, room_map: Path
         assert result.provenance.tile == tile
 
 
-def test_what_nobody_names_is_removed_from_s3_after_its_time(
+def test_unnamed_files_are_removed_from_s3_after_their_time(
     s3_bucket: str, room_map: Path, other_map: Path
 ):
     where = f"{s3_bucket}/campus"
@@ -94,7 +92,7 @@ def test_of_manifests_of_one_number_the_first_counts(s3_bucket: str):
     assert second.manifest() == b"29"
 
 
-def test_what_another_machine_wrote_since_the_last_listing_is_there(s3_bucket: str):
+def test_files_written_since_the_last_listing_are_found(s3_bucket: str):
     first = ObjectStore(f"{s3_bucket}/campus")
     object_store.open_objects.cache_clear()
     second = ObjectStore(f"{s3_bucket}/campus")
@@ -121,7 +119,7 @@ def test_a_manifest_that_is_removed_while_it_is_read_is_sought_again(
     assert store.manifest() == b"2"
 
 
-def test_a_conflict_with_another_writer_is_tried_anew_and_other_failures_are_told(
+def test_a_write_conflict_is_retried_and_other_failures_are_raised(
     monkeypatch: pytest.MonkeyPatch,
 ):
     pytest.importorskip("obstore", reason="the extra cluster is not installed")
@@ -155,7 +153,7 @@ def test_an_answer_that_was_lost_is_no_other_writer(
     assert store.manifest() == b"1"
 
 
-def test_a_bucket_that_is_not_there_is_said(s3_bucket: str, room_map: Path):
+def test_a_missing_bucket_is_named(s3_bucket: str, room_map: Path):
     with pytest.raises(AtlasError, match="404 Not Found"):
         Atlas.open(f"{s3_bucket}-not/campus")
     with pytest.raises(AtlasError, match="does not answer, or not as a store"):

@@ -99,14 +99,14 @@ def _bad(**changes: Any) -> str:
     ],
     ids=["a second line", "no covariance", "truth of NaN", "no answers", "nested", "text"],
 )
-def test_what_is_no_result_is_named(text: Callable[[], str], said: str, tmp_path: Path):
+def test_an_invalid_result_is_named(text: Callable[[], str], said: str, tmp_path: Path):
     (tmp_path / "x.json").write_text(text())
     with pytest.raises(TopolocError, match=said) as failure:
         read_results(tmp_path / "x.json")
     assert "x.json" in str(failure.value)
 
 
-def test_only_what_was_understood_goes_on(tmp_path: Path):
+def test_unknown_keys_are_dropped(tmp_path: Path):
     (tmp_path / "x.json").write_text(
         json.dumps(replace(FOUND, geopose=None).to_json("<b>") | {"evil": "</script>"})
     )

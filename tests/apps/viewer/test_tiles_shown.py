@@ -25,8 +25,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
 
 HALL_FROM_ROOM = Rigid3(exp_so3(np.array([0.0, 0.0, 0.5])), np.array([10.0, -2.0, 1.0]))
-"""`hall` and `room` are the same map, said to lie so to each other; `far` is a third one, of which
-nothing is known."""
+"""Join of `hall` and `room`, which are copies of one map. `far` is a third copy without a join."""
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +128,7 @@ def test_an_export_holds_all_of_them(campus: Path):
     )
 
 
-def test_the_commands_show_the_largest_world_and_say_what_is_left_out(
+def test_the_commands_show_the_largest_world_and_list_other_tiles(
     campus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     page = tmp_path / "campus.html"

@@ -35,11 +35,11 @@ def test_points_of_several_nodes_become_one(tiny_recording: Path):
     assert len(tracks.points_world) < 0.8 * num_seen
     shown = tracks.point_rows >= 0
     assert shown.mean() > 0.8
-    assert tracks.errors_px[shown].max() <= MAX_ERROR_PX * 0.5  # of pictures of 320 pixels
+    assert tracks.errors_px[shown].max() <= MAX_ERROR_PX * 0.5  # for images of 320 pixels
     owners = np.repeat(rows, [len(node.points_cam) for node in topomap.nodes])
     pairs = np.column_stack([tracks.point_rows, owners])[shown]
-    assert len(np.unique(pairs, axis=0)) == len(pairs), "two key points of one picture in one track"
-    # a point that is joined lies where its nodes have it
+    assert len(np.unique(pairs, axis=0)) == len(pairs), "two key points of one image in one track"
+    # a joined point has the position of its nodes' points
     own = np.concatenate(
         [
             node.summary.world_from_cam.apply(node.points_cam.astype(np.float64))

@@ -293,7 +293,7 @@ def test_without_an_output_the_browser_opens(
     assert json.loads((tmp_path / "scene.json").read_text())["format"] == "topoloc-scene"
 
 
-def test_answers_of_another_map_are_told(
+def test_results_of_another_map_are_reported(
     room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     other = Localization(Rigid3.identity(), COVARIANCE, 0.9, 0, [], 5, 5).to_json("a") | {

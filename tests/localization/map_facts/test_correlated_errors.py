@@ -71,7 +71,7 @@ def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
     return measured
 
 
-def test_a_map_knows_what_was_measured_when_it_was_built(
+def test_a_map_stores_the_share_measured_at_its_build(
     room_map: Path, measurings: list[TopoMetricMap]
 ):
     loaded = TopoMetricMap.load(room_map)
@@ -125,7 +125,7 @@ def test_of_other_nodes_it_is_measured_anew(room_map: Path, measurings: list[Top
     assert measurings == [moved]
 
 
-def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Path):
+def test_a_map_of_one_node_gets_a_medium_share(tiny_recording: Path):
     topomap = built_room(tiny_recording)
     single = replace(
         topomap.with_first_layer(nodes=topomap.nodes[:1]), summaries=topomap.summaries[:1], edges=[]
@@ -154,7 +154,7 @@ def test_the_first_query_computes_nothing_of_the_map(
     assert localizer.context.first.map.focal == frame.camera.fx
     Localizer(TopoMetricMap.load(room_map)).localize(
         frame.image, frame.camera
-    )  # what Numba compiles is hashed, too
+    )  # Numba hashes its code, too
 
     def never(*args: object) -> None:
         raise AssertionError("a digest of the nodes, or what the map knows, at a query")

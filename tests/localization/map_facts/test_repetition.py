@@ -59,7 +59,7 @@ def _wall(num_panels: int, noise: float = 0.0) -> LocalMap:
     )
 
 
-# shifts within what is nearby
+# shifts to nearby copies
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])
@@ -72,11 +72,11 @@ def test_a_wall_of_equal_panels_repeats_itself_by_whole_panels(noise: float):
     assert {-1, 1} <= set(np.round(along).astype(int))
 
 
-def test_what_is_there_once_does_not_repeat_itself():
+def test_unique_surfaces_have_no_repetition():
     assert len(find_repetition_shifts(_wall(1), _wall(1))) == 0
 
 
-def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_panels():
+def test_similar_parts_within_a_panel_are_no_repetition():
     """With one handle above another, a third of the points have a copy there. All points have one
     in the next panel."""
     wall = _wall(4)
@@ -90,13 +90,13 @@ def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_
     )
 
 
-def test_folded_points_of_all_panels_are_those_of_one():
+def test_folded_points_of_all_panels_are_the_points_of_one():
     points_world = fold_repetitions(_wall(4).points_world, np.array([PERIOD, -PERIOD, 2 * PERIOD]))
     spread = points_world.reshape(4, len(PANEL), 3) - points_world[: len(PANEL)]
     np.testing.assert_allclose(spread, 0.0, atol=1e-9)
 
 
-def test_copies_are_the_points_and_what_each_shift_makes_of_them():
+def test_copies_are_the_points_and_each_shift_of_them():
     np.testing.assert_allclose(
         shifted_copies(PANEL, PERIOD[None])[1] - PANEL, np.tile(PERIOD, (len(PANEL), 1))
     )
@@ -127,7 +127,7 @@ def test_a_room_that_stands_once_in_the_map_has_no_copy(room: TopoMetricMap):
     assert not any(_turned(opened, row) for row in range(len(room.nodes)))
 
 
-def test_what_the_build_found_is_kept_in_the_file_and_not_sought_again(
+def test_repetitions_of_the_build_are_stored_and_not_searched_again(
     room: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     built = with_repetitions(twice(room))
@@ -145,7 +145,7 @@ def test_what_the_build_found_is_kept_in_the_file_and_not_sought_again(
     assert sought == []
 
 
-def test_what_was_found_of_other_nodes_is_found_anew(room: TopoMetricMap):
+def test_repetitions_of_changed_nodes_are_searched_again(room: TopoMetricMap):
     assert room.repetitions is not None
     doubled = twice(room)
     assert doubled.repetitions is room.repetitions
@@ -165,7 +165,7 @@ class _OnlyTheFirstRoom:
 
 
 @pytest.mark.parametrize("max_repetitions", [LocalizerConfig().max_repetitions, 0])
-def test_a_copy_that_retrieval_does_not_name_is_found_by_the_map(
+def test_a_copy_missed_by_retrieval_is_found_by_the_map(
     room: TopoMetricMap, max_repetitions: int, monkeypatch: pytest.MonkeyPatch
 ):
     """Without repetitions, one of the two places is reported, and half of these poses are wrong."""

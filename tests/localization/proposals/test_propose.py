@@ -45,7 +45,7 @@ def _sources(trace: Trace) -> list[str]:
     return [tried.source for tried in trace.tried]
 
 
-# look-alikes
+# similar places
 
 
 def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(
@@ -71,7 +71,7 @@ def test_a_place_that_is_in_the_map_twice_is_ambiguous_and_both_poses_are_named(
         assert [one["node"] for one in named] == [one.node_id for one in result.alternatives]
 
 
-def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without_an_answer(
+def test_retrieval_alone_misses_the_second_place_or_the_pose(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     """What other proposals are for."""
@@ -83,7 +83,7 @@ def test_by_retrieval_alone_the_second_place_goes_unnoticed_or_the_image_without
     )
 
 
-def test_a_place_that_is_only_partly_like_another_is_told_apart(room: TopoMetricMap):
+def test_a_partly_similar_place_is_distinguished(room: TopoMetricMap):
     localizer = Localizer(twice(room, share_alike=0.2))
     found = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
     right = [
@@ -114,7 +114,7 @@ def _dark(picture: np.ndarray, light: float, seed: int) -> np.ndarray:
     return np.clip(light * picture + noise, 0, 255).astype(np.uint8)
 
 
-def test_dark_images_are_localized_that_are_not_without_viewpoints(room: TopoMetricMap):
+def test_dark_images_are_localized_only_with_viewpoints(room: TopoMetricMap):
     views = [
         (_dark(picture, light, k), truth)
         for light in LIGHTS
@@ -151,7 +151,7 @@ def _never_clear(room: TopoMetricMap, config: LocalizerConfig | None = None) -> 
     )
 
 
-def test_images_that_are_never_clear_are_answered_all_the_same_and_those_of_elsewhere_are_not(
+def test_images_without_a_clear_pose_are_localized_and_out_of_map_images_are_not(
     room: TopoMetricMap,
 ):
     localizer = _never_clear(room)
@@ -166,7 +166,7 @@ def test_images_that_are_never_clear_are_answered_all_the_same_and_those_of_else
     )
 
 
-def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_inliers_first(
+def test_a_pose_of_several_viewpoints_is_tried_once_with_most_inliers_first(
     room: TopoMetricMap,
 ):
     """All nodes around show the same place, so that one pose follows."""
@@ -182,7 +182,7 @@ def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_i
     assert all(np.linalg.norm(a - b) > 0.05 for k, a in enumerate(centres) for b in centres[:k])
 
 
-def test_only_so_many_viewpoints_are_followed_up(room: TopoMetricMap):
+def test_the_number_of_tried_viewpoints_is_limited(room: TopoMetricMap):
     trace = Trace()
     _never_clear(room, LocalizerConfig()).localize(unseen_views()[2][0], CAMERA, trace=trace)
     assert 1 <= _sources(trace).count("viewpoints") <= 4
@@ -205,7 +205,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[PointMatches]:
     return found
 
 
-def test_an_image_from_elsewhere_is_refused_after_the_first_pose(
+def test_an_out_of_map_image_is_refused_after_the_first_proposal(
     room: TopoMetricMap, fits: list[PointMatches]
 ):
     """No similar place is tried and no viewpoint uses RANSAC, so that a refusal is as
@@ -254,18 +254,16 @@ def test_a_prior_replaces_the_coarse_search(room: TopoMetricMap, monkeypatch: py
     assert nearest.node_id in {candidate.node_id for candidate in result.candidates}
 
 
-def test_a_prior_that_is_wrong_makes_no_place_of_an_image_from_elsewhere(room: TopoMetricMap):
+def test_a_wrong_prior_does_not_localize_an_out_of_map_image(room: TopoMetricMap):
     localizer, (_, somewhere) = Localizer(room), unseen_views()[2]
     for picture, _ in unseen_views(seed=1, step=4.0):
         assert isinstance(localizer.localize(picture, CAMERA, prior=somewhere), NotLocalized)
 
 
-# what was found already
+# repeated poses
 
 
-def test_a_pose_that_was_found_already_is_not_followed_up_again(
-    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_repeated_pose_is_not_tried_again(room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
     followed = list[Proposal]()
 
     def follow(proposal: Proposal) -> Hypothesis | None:
@@ -293,7 +291,7 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(
 # refinement
 
 
-def test_a_clear_pose_is_refined_with_its_own_nodes_if_the_nearest_ones_see_something_else(
+def test_a_clear_pose_is_refined_with_its_own_nodes_if_the_nearest_ones_differ(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     """This happens around a bend. The farthest node stands for the nearest ones."""

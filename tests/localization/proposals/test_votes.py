@@ -64,7 +64,7 @@ def test_votes_find_the_place_when_other_nodes_rank_first(
 
 
 @pytest.mark.usefixtures("any_agreement")
-def test_votes_are_few_elsewhere_and_nodes_left_out_have_none(
+def test_votes_are_few_for_out_of_map_images_and_excluded_nodes_have_none(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     counted, count_votes = list[tuple[list[int], float]](), votes.count_votes

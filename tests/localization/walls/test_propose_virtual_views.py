@@ -90,7 +90,7 @@ def _is_pose(world_from_cam: Rigid3, truth: Rigid3) -> bool:
     ) < np.deg2rad(5.0)
 
 
-def test_the_way_back_is_localized_by_the_walls():
+def test_the_reverse_direction_is_localized_by_virtual_views():
     assert all(_is_right(result, truth) for result, truth in _found_on_the_way_back())
     without = Localizer(built_corridor(), NO_WALLS)
     answers = [
@@ -99,11 +99,11 @@ def test_the_way_back_is_localized_by_the_walls():
     answered = [
         _is_right(result, truth) for result, truth in answers if isinstance(result, Localization)
     ]
-    assert len(answered) < 0.5 * len(answers)  # where viewpoints suffice
+    assert len(answered) < 0.5 * len(answers)  # localized by node viewpoints
     assert all(answered)
 
 
-def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
+def test_a_pose_of_virtual_views_contains_its_evidence(localizer: Localizer):
     topomap = localizer.topomap
     assert topomap.sides is not None
     with_sides = {summary.name for summary in topomap.sides.summaries}
@@ -117,7 +117,7 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
         assert 0.5 <= result.probability <= 1.0
         node = topomap.summaries[
             result.node_id
-        ]  # an ordinary one, which saw the same wall from its other side
+        ]  # a mapping image of the same wall from the other direction
         assert node.name in with_sides
         assert 2.0 < truth.translation[1] - node.world_from_cam.translation[1] < 7.5
         assert len(result.candidates) == localizer.config.num_candidates
@@ -133,7 +133,7 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
         assert np.sqrt(np.linalg.eigvalsh(result.camera_covariance[:3, :3])[-1]) < 0.3
 
 
-def test_the_points_seen_are_handed_on(localizer: Localizer):
+def test_the_matched_points_are_returned(localizer: Localizer):
     """Streams track the matched points. Each is a point of the virtual views, at its
     pixel in the image."""
     picture, truth = seen_on_the_way_back()[2]
@@ -147,7 +147,7 @@ def test_the_points_seen_are_handed_on(localizer: Localizer):
     assert np.median(offsets) < 3.0
 
 
-def test_the_walls_are_looked_at_once_for_all_maps(
+def test_virtual_views_of_a_query_are_made_once_for_all_maps(
     localizer: Localizer, monkeypatch: pytest.MonkeyPatch
 ):
     extracted = list[tuple[int, ...]]()
@@ -166,13 +166,13 @@ def test_the_walls_are_looked_at_once_for_all_maps(
     assert len(extracted) == 2  # to the left and to the right
 
 
-def test_another_camera_with_distortion_is_localized_on_the_way_back(localizer: Localizer):
+def test_a_distorted_camera_is_localized_in_reverse_direction(localizer: Localizer):
     truth = back(5.2, x=0.1, yaw=0.04)
     picture, _ = render(corridor(), truth, DISTORTED, noise_seed=3)
     assert _is_right(localizer.localize(picture, DISTORTED), truth)
 
 
-def test_pictures_in_the_map_s_own_direction_are_answered_as_without_walls(localizer: Localizer):
+def test_images_in_the_mapped_direction_have_the_result_without_virtual_views(localizer: Localizer):
     without = Localizer(built_corridor(), NO_WALLS)
     for picture, _ in seen_ahead():
         one, other = localizer.localize(picture, WIDE), without.localize(picture, WIDE)
@@ -198,7 +198,7 @@ def _elsewhere() -> dict[str, np.ndarray]:
     }
 
 
-def test_pictures_from_elsewhere_are_refused(localizer: Localizer):
+def test_out_of_map_images_are_refused(localizer: Localizer):
     answered = [
         name
         for name, picture in _elsewhere().items()
@@ -207,14 +207,14 @@ def test_pictures_from_elsewhere_are_refused(localizer: Localizer):
     assert answered == []
 
 
-def test_a_wall_in_a_mirror_is_no_wall_of_the_map(localizer: Localizer):
+def test_a_mirrored_wall_is_refused(localizer: Localizer):
     for picture, _ in seen_on_the_way_back()[::3]:
         assert isinstance(
             localizer.localize(np.ascontiguousarray(picture[:, ::-1]), WIDE), NotLocalized
         )
 
 
-def test_a_camera_that_is_not_known_or_sees_no_walls_gets_no_answer_by_them(localizer: Localizer):
+def test_an_unknown_or_narrow_camera_gets_no_pose_of_virtual_views(localizer: Localizer):
     picture, truth = seen_on_the_way_back()[0]
     assert "walls" not in localizer.localize(picture, None).times_ms
     narrow = Camera.pinhole(480, 320, 900.0, 900.0, 239.5, 159.5)
@@ -252,7 +252,7 @@ def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
     )
 
 
-def test_walls_that_stand_in_two_places_are_no_answer():
+def test_repeated_virtual_views_give_no_pose():
     localizer = Localizer(_twice(built_corridor(), apart=60.0))
     results = [
         (localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()[::2]
@@ -287,7 +287,7 @@ def _search(
     )
 
 
-def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_to():
+def test_an_inexact_place_is_tried_again_from_its_pose():
     picture, truth = seen_on_the_way_back()[2]
     search = _search(built_corridor(), picture)
     assert search.map.walls is not None
@@ -305,7 +305,7 @@ def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("num_retrieved", [0, 10])
-def test_nearest_parts_show_a_place_before_whole_views_unless_nodes_agree(
+def test_nearest_parts_are_matched_before_whole_views_unless_nodes_agree(
     monkeypatch: pytest.MonkeyPatch, seed: int, num_retrieved: int
 ):
     tangents, extract = list[float](), virtual_view_matching._extract_view_features
@@ -326,7 +326,7 @@ def test_nearest_parts_show_a_place_before_whole_views_unless_nodes_agree(
     assert tangents == nearest + whole
 
 
-def test_places_with_far_fewer_matches_are_not_looked_at_beside_a_clear_pose(
+def test_places_with_far_fewer_matches_are_skipped_beside_a_clear_pose(
     monkeypatch: pytest.MonkeyPatch,
 ):
     search, looked = _search(built_corridor(), seen_on_the_way_back()[0][0]), list[int]()
@@ -348,7 +348,7 @@ def test_places_with_far_fewer_matches_are_not_looked_at_beside_a_clear_pose(
     assert min(looked) >= 0.5 * max(looked) - 1
 
 
-def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes(
+def test_poses_in_the_direction_of_nodes_are_left_to_the_nodes(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr(VirtualViewSearchConfig, "min_distance", 0.0)
@@ -363,7 +363,7 @@ def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes(
     assert _by_the_walls(built_corridor(), picture) == []
 
 
-def test_walls_that_look_alike_elsewhere_have_less_for_them():
+def test_repeated_virtual_views_have_lower_odds():
     """Equal points are no evidence for one of the two places, and each place is proposed once."""
     picture, truth = seen_on_the_way_back()[2]
     once, twice = (
@@ -378,7 +378,7 @@ def test_walls_that_look_alike_elsewhere_have_less_for_them():
     assert sorted(round((way - truth.translation[1]) / 60.0) for way in ways[:2]) == [0, 1]
 
 
-def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
+def test_learned_features_use_the_virtual_views_of_the_map(tmp_path: Path):
     path = tmp_path / "corridor.topo"
     corridor_of_two_kinds().save(path)
     loaded = TopoMetricMap.load(path)
@@ -406,9 +406,9 @@ def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
         TopoMetricMap.load(path)
 
 
-def test_walls_that_the_nodes_own_kind_describes_are_asked_still(monkeypatch: pytest.MonkeyPatch):
+def test_virtual_views_of_the_nodes_feature_type_are_still_used(monkeypatch: pytest.MonkeyPatch):
     network = default_learned_type()
-    with monkeypatch.context() as patch:  # as maps were, before walls had a network of their own
+    with monkeypatch.context() as patch:  # like maps before the network for virtual views
         patch.setitem(FEATURE_TYPES, network, replace(FEATURE_TYPES[network], sides=None))
         topomap = build_map(
             WalkAhead(0), BuildConfig(features=FeatureConfig(kind=network), other_kinds=())
@@ -423,7 +423,7 @@ def test_walls_that_the_nodes_own_kind_describes_are_asked_still(monkeypatch: py
         assert _is_right(result, truth)
 
 
-def test_from_a_file_the_same_is_answered(tmp_path: Path):
+def test_a_map_from_a_file_gives_the_same_result(tmp_path: Path):
     path = tmp_path / "corridor.topo"
     built_corridor().save(path)
     picture, truth = seen_on_the_way_back()[1]
@@ -439,9 +439,7 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT.keys())
-def test_side_nodes_that_cannot_be_ranked_are_a_map_error_where_they_are_asked(
-    tmp_path: Path, change: str
-):
+def test_virtual_views_that_cannot_be_ranked_are_a_map_error(tmp_path: Path, change: str):
     path = tmp_path / "corridor.topo"
     built_corridor().save(path)
     database = sqlite3.connect(path)

@@ -126,7 +126,7 @@ def test_too_few_matches_give_none(num_matches: int):
     assert estimate_upright_pose(wall.seen[:num_matches], wall.points[:num_matches]) is None
 
 
-def test_three_that_agree_are_enough_and_three_that_do_not_are_none():
+def test_three_agreeing_matches_are_enough_and_others_are_not():
     wall, rows = _wall(_upright(0.1, -4.0, 0.0, 0.2)), [3, 20, 41]
     found = estimate_upright_pose(wall.seen[rows], wall.points[rows])
     assert found is not None

@@ -33,13 +33,13 @@ def _named(index: VirtualViewIndex, views: list[VirtualView]) -> list[CandidateP
     return [CandidatePlaces.of(view, index, np.ones(len(index.axes), np.float32)) for view in views]
 
 
-def test_each_side_node_names_a_place_that_looks_back_at_its_wall(
+def test_each_virtual_view_gives_a_place_that_faces_its_wall_in_reverse(
     index: VirtualViewIndex, views: list[VirtualView]
 ):
     named = _named(index, views)
     assert sum(len(of_view.likeness) for of_view in named) == len(
         index.axes
-    )  # to the left who comes back sees what was to the right
+    )  # left and right are exchanged in reverse direction
     for view, of_view in zip(views, named, strict=True):
         assert (of_view.rotations[:, :, 2] @ back(5.0).rotation[:, 2] > 0.9).all()
         for rotation, centre in zip(of_view.rotations, of_view.centres, strict=True):
@@ -52,7 +52,7 @@ def test_each_side_node_names_a_place_that_looks_back_at_its_wall(
             ).any()
 
 
-def test_a_place_that_both_views_name_comes_before_one_that_is_more_like_one_of_them(
+def test_a_place_of_both_views_ranks_before_a_better_place_of_one(
     index: VirtualViewIndex, views: list[VirtualView]
 ):
     """Along the corridor (y), both views are similar to one place, and one view is more
@@ -69,7 +69,7 @@ def test_a_place_that_both_views_name_comes_before_one_that_is_more_like_one_of_
     assert abs(select_likeliest_places(named[:1], 1, APART)[0].translation[1] - twin) < APART
 
 
-def test_places_are_apart_and_as_many_as_are_asked_for(
+def test_places_are_apart_and_as_many_as_requested(
     index: VirtualViewIndex, views: list[VirtualView]
 ):
     chosen = select_likeliest_places(_named(index, views), 3, APART)
@@ -80,7 +80,7 @@ def test_places_are_apart_and_as_many_as_are_asked_for(
     assert select_likeliest_places(_named(index, views), 0, APART) == []
 
 
-def test_nothing_named_is_no_place():
+def test_no_retrieved_view_gives_no_place():
     nothing = CandidatePlaces(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0, np.float32))
     assert select_likeliest_places([nothing, nothing], 8, APART) == []
     assert select_likeliest_places([], 8, APART) == []

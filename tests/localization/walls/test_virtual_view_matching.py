@@ -64,21 +64,21 @@ def _around() -> list[tuple[QueryVirtualView, LocalMap]]:
 
 
 @pytest.mark.parametrize("y", [4.0, 5.0, 6.5])
-def test_the_side_nodes_around_a_pose_show_the_wall_that_it_sees_whoever_stood_where(y: float):
+def test_the_selected_virtual_nodes_show_the_visible_wall(y: float):
     centres, axes = _centres_and_axes()
     for view in make_virtual_views(WIDE):
         side_ids = select_nearest_virtual_nodes(view, back(y).inverse(), centres, axes, 3)
         assert 1 <= len(side_ids) <= 3
         to_the_right = (back(y) @ view.cam_from_virtual).rotation[0, 2]
-        assert (centres[side_ids, 0] * to_the_right > 1.0).all()  # on the one wall
-        # who stands at y and looks back sees what is 1 to 3 wall distances behind y; its middle
+        assert (centres[side_ids, 0] * to_the_right > 1.0).all()  # all on the same wall
+        # a camera at y in reverse direction sees 1 to 3 wall distances behind y, and the middle
         # comes first
         off_middle = np.abs(centres[side_ids, 1] - (y - 2.2))
         assert off_middle[0] < 0.6
         assert off_middle.max() < 2.2
 
 
-def test_no_side_node_is_near_a_pose_elsewhere():
+def test_no_virtual_node_is_near_a_distant_pose():
     centres, axes = _centres_and_axes()
     for view in make_virtual_views(WIDE):
         assert select_nearest_virtual_nodes(view, back(60.0).inverse(), centres, axes, 4) == []
@@ -90,7 +90,7 @@ def test_no_side_node_is_near_a_pose_elsewhere():
         )
 
 
-def test_matches_of_both_sides_lie_where_the_pose_puts_the_points():
+def test_matches_of_both_views_lie_at_the_projected_points():
     found = match_virtual_views(_around(), TRUTH.inverse(), WIDE, GUIDED)
     assert found is not None
     assert len(found.features) == sum(len(side.features) for side in _seen())
@@ -129,7 +129,7 @@ def test_at_a_wrong_pose_little_more_is_found_than_by_chance():
     )
 
 
-def test_visible_points_are_counted_by_what_they_cover_not_by_how_many_nodes_hold_them():
+def test_visible_points_are_counted_by_area_and_not_by_nodes():
     once = count_virtual_views(_around(), TRUTH.inverse(), GUIDED)
     twice = count_virtual_views(
         [(side, LocalMap.concatenate([points, points])) for side, points in _around()],
@@ -139,9 +139,9 @@ def test_visible_points_are_counted_by_what_they_cover_not_by_how_many_nodes_hol
     assert 100 < once.num_visible == twice.num_visible
 
 
-def test_what_must_be_seen_lies_in_the_picture_where_the_points_are():
+def test_visible_points_lie_at_their_pixels():
     counts = count_virtual_views(_around(), TRUTH.inverse(), GUIDED)
-    assert counts.agreeing_img is None  # SURF says nothing of what is not found
+    assert counts.agreeing_img is None  # SURF has no dense descriptors
     assert 100 < len(counts.visible_img) <= 2 * 512
     points_img = np.concatenate(
         [WIDE.img_from_cam(TRUTH.inverse().apply(points.points_world)) for _, points in _around()]
@@ -152,7 +152,7 @@ def test_what_must_be_seen_lies_in_the_picture_where_the_points_are():
     assert offsets.max() < 2.0  # pixels of the side view are rounded
 
 
-def test_the_pose_of_both_sides_is_refined_round_by_round_from_one_that_is_near():
+def test_a_near_pose_of_both_views_is_refined_in_rounds():
     """Matches around an inexact pose are biased towards it, so that one round is not enough."""
     world_from_cam = Rigid3(TRUTH.rotation, TRUTH.translation + np.array([0.03, -0.06, 0.02]))
     config = AbsolutePoseConfig(max_reprojection_error_px=6.0, sigma_px=2.0)

@@ -131,7 +131,7 @@ def test_weights_that_poses_were_drawn_with_are_found_again():
     assert fitted.clear_log_odds > clearest
 
 
-def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
+def test_an_out_of_map_image_lowers_the_bias_until_it_is_refused():
     poses = _drawn(1500)
     strongest = max(
         (pose.evidence for pose in poses),
@@ -147,7 +147,7 @@ def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
 
 def test_every_family_is_judged_by_a_fit_without_it():
     poses = _drawn(3000)
-    # in one family the evidence says the opposite: only a fit that has seen it could know
+    # the evidence of one family is inverted, which a fit without it cannot learn
     turned = [
         replace(pose, error_m=3.0 if pose.is_right else 0.01) if pose.mapping == MAPS[0] else pose
         for pose in poses
@@ -158,7 +158,7 @@ def test_every_family_is_judged_by_a_fit_without_it():
     assert sum(len(part.is_right) for part in held_out.values()) == len(decided(turned))
 
 
-def test_few_poses_stay_with_the_prior_and_the_strength_follows_what_was_not_fitted_to():
+def test_few_poses_stay_with_the_prior_and_held_out_poses_set_its_strength():
     poses = _drawn(90)
     assert fit_evidence(poses, TRUE, 1e4).as_vector == pytest.approx(TRUE.as_vector, abs=0.01)
     assert best_strength(poses, TRUE) > best_strength(
@@ -166,7 +166,7 @@ def test_few_poses_stay_with_the_prior_and_the_strength_follows_what_was_not_fit
     )
 
 
-def test_calibration_error_is_the_mean_gap_of_what_would_be_answered():
+def test_calibration_error_is_the_mean_gap_of_reported_poses():
     log_odds = np.array(
         [math.log(9.0)] * 10 + [-3.0] * 50
     )  # ten answers of 0.9, of which six are right
@@ -214,7 +214,7 @@ def test_wrong_poses_are_tried_as_well_and_not_stopped_before(
     assert set(stops) == {NodeStop()} != {load_fitted_weights("topoloc-net").stop}
 
 
-def test_pairs_are_of_one_picture_and_too_few_of_them_change_nothing():
+def test_pairs_are_of_one_image_and_too_few_of_them_change_nothing():
     strong, weak = (
         Evidence(150, 90, 300, 900, 20, 0.8, 0.1, 0.3),
         Evidence(150, 60, 250, 900, 20, 0.7, 0.3, 0.05),
@@ -262,7 +262,7 @@ def test_the_command_writes_a_file_that_ships(
     ("kind", "said"),
     [("orb", "no features of kind 'orb'"), ("sift", "right and wrong poses of two families")],
 )
-def test_what_cannot_be_fitted_is_told_in_one_line(
+def test_impossible_fits_are_one_line(
     kind: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     save_poses([pose for pose in _drawn(50) if pose.is_wrong], tmp_path / "poses.json")
@@ -287,7 +287,7 @@ def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose
     return poses
 
 
-def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few():
+def test_weights_of_virtual_views_are_recovered_and_kept_with_few_poses():
     before = load_fitted_weights("surf")
     true = replace(
         before,

@@ -14,7 +14,7 @@ def units(seed: int, count: int = 20) -> torch.Tensor:
     return functional.normalize(torch.randn(2, count, 16, generator=generator), dim=2)
 
 
-def test_descriptors_are_sampled_where_the_contract_says():
+def test_descriptors_are_sampled_as_in_the_contract():
     """The map's values are their own position, (x, y, 1), before normalization."""
     stride, width, height = 4, 10, 8
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -35,7 +35,7 @@ def test_likeness_is_nothing_only_for_the_teachers_own():
     assert likeness(ours, wrong, valid) < 1e-6
 
 
-def test_points_are_told_from_rivals_but_not_from_neighbours():
+def test_points_are_separated_from_rivals_but_not_from_neighbours():
     ours, valid = units(0), torch.ones(2, 20, dtype=torch.bool)
     near = torch.zeros(2, 20, 20, dtype=torch.bool)
     clean = told_apart(ours, ours, valid, near)
@@ -58,7 +58,7 @@ def test_scores_are_drawn_to_the_teachers_peaks_inside_the_picture():
     assert peaks(missed, target, inside) < 0.01
 
 
-def test_a_key_point_is_asked_for_in_its_own_pixel():
+def test_a_key_point_is_required_in_its_own_pixel():
     target = torch.zeros(1, 1, 16, 16)
     target[0, 0, 4, 4], target[0, 0, 12, 3] = 0.9, 0.03
     inside = torch.ones(1, 1, 16, 16, dtype=torch.bool)

@@ -51,7 +51,7 @@ def test_pairs_need_the_poses(tmp_path: Path):
         find_side_pairs(WalkAhead(0, num_pairs=2), walk_back(with_pose=False), tmp_path)
 
 
-def test_a_slanted_wall_keeps_its_places_and_loses_what_is_far():
+def test_a_slanted_wall_keeps_its_points_and_loses_distant_ones():
     texture = cv2.resize(smooth_texture(3, (1.0, 0.8)), (320, 256)).astype(np.float32) / 255
     fine = (texture + 0.3 * (np.indices(texture.shape)[1] % 14 < 7)).astype(
         np.float32

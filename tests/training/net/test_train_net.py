@@ -48,7 +48,7 @@ def config(teacher: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainNet:
     return TrainNet(teacher, [str(folder)], batch=1, steps=4)
 
 
-def test_training_goes_on_where_it_was_stopped(
+def test_training_resumes_after_a_stop(
     config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(training, "_LOG_EVERY", 2)
@@ -96,7 +96,9 @@ def test_the_network_comes_nearer_to_its_teacher(config: TrainNet, tmp_path: Pat
     assert last[4] < 0.8 * first[4]
 
 
-def test_training_begins_with_what_fits_of_an_earlier_state(config: TrainNet, tmp_path: Path):
+def test_training_begins_with_matching_weights_of_an_earlier_state(
+    config: TrainNet, tmp_path: Path
+):
     torch.manual_seed(7)
     earlier = TopolocNet().state_dict()
     earlier["lateral.bias"] = torch.zeros(3)
@@ -129,7 +131,7 @@ def test_training_begins_with_an_exported_network(tmp_path: Path):
         load_exported(after, tmp_path / "other.onnx")
 
 
-def test_walls_are_learned_of_each_other_alone(config: TrainNet, tmp_path: Path):
+def test_virtual_views_are_trained_only_with_each_other(config: TrainNet, tmp_path: Path):
     lessons = learn(config.pictures, config.teacher, tmp_path)
     pixels = (
         np.stack(np.meshgrid(np.arange(200, 420.0), np.arange(80, 260.0)), axis=-1)
@@ -148,7 +150,7 @@ def test_walls_are_learned_of_each_other_alone(config: TrainNet, tmp_path: Path)
     assert across > 1.0
 
 
-def test_scores_are_learned_where_the_teacher_saw_the_very_pixels(config: TrainNet, tmp_path: Path):
+def test_scores_are_trained_on_pixels_that_the_teacher_saw(config: TrainNet, tmp_path: Path):
     lessons = learn(config.pictures, config.teacher, tmp_path)
     sample = draw_sample(lessons, [], [], PLAIN, np.random.default_rng(3))
     assert sample.inside[0].all()
@@ -168,7 +170,9 @@ def test_scores_are_learned_where_the_teacher_saw_the_very_pixels(config: TrainN
     )
 
 
-def test_a_teacher_is_asked_once(config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_teacher_runs_once_per_image(
+    config: TrainNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     lessons = learn(config.pictures, config.teacher, tmp_path)
     assert lessons.pictures.shape == (3, teaching.HEIGHT, teaching.WIDTH)
     pixels = np.array([[100.0, 50.0], [321.5, 200.25]])

@@ -79,7 +79,7 @@ def test_reflectances_are_true_to_life(name: str):
     assert not isinstance(material.color, tuple)
     linear = (material.color / 255.0) ** 2.2
     assert 0.03 < linear.mean() < 0.85
-    # Structure is faint: rooms are not test pictures.
+    # Structure is faint: rooms are no test charts.
     assert 0.002 < linear.mean(axis=2).std() < 0.12
 
 
@@ -89,7 +89,7 @@ def test_plaster_is_nearly_plain():
     assert color.astype(float).std() < 8.0
 
 
-def test_a_line_is_written_where_and_as_wide_as_told():
+def test_a_line_has_the_given_place_and_width():
     picture = blank((60, 300), (1.0, 1.0, 1.0))
     width = write(picture, "Numerical Recipes", (20, 40), 30, (0.0, 0.0, 0.0), max_width_px=120)
     rows, columns = np.nonzero(picture[:, :, 0] < 128)

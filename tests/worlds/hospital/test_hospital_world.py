@@ -74,7 +74,7 @@ def test_a_panel_is_the_copy_of_the_next(day: Scene):
 
 
 @pytest.mark.parametrize("name", ["handrail brackets", "lamp cover"])
-def test_what_is_put_up_has_the_panels_period(day: Scene, name: str):
+def test_mounted_objects_have_the_period_of_the_panels(day: Scene, name: str):
     """Each vertex on the south wing's outer wall has a copy one bay further, except at doors
     and at the ends."""
     points = named(day, name).mesh.vertices
@@ -124,7 +124,7 @@ def test_the_condition_changes_light_and_nothing_else(day: Scene):
     assert evening.sky.sun_direction is None
 
 
-def test_all_lamps_are_alike_so_that_light_does_not_tell_one_bay_from_another(day: Scene):
+def test_all_lamps_are_alike_so_that_light_distinguishes_no_bays(day: Scene):
     assert len(lamp_sites()) == round((2 * (LENGTH - 2 * WING) + 2 * (WIDTH - 2 * WING)) / BAY) + 4
     assert sum(surface.material.kind == "light" for surface in day.surfaces) == 1
 

@@ -26,7 +26,7 @@ CONFIG = RenderConfig(bake=LightBakeConfig(finest=0.1, angle=0.03, rays=4000, pa
 FLOOR = Surface(
     "floor", panel((-4, 4, 0), (8, 0, 0), (0, -8, 0)), Material("matt", (0.5, 0.5, 0.5))
 )
-GREY = 0.2140  # what 0.5 of sRGB reflects
+GREY = 0.2140  # reflectance of 0.5 in sRGB
 
 
 @pytest.fixture(autouse=True)
@@ -101,7 +101,7 @@ def test_pictures_agree_with_those_of_paths_of_their_own():
     assert np.median(np.abs(baked / np.maximum(reference, 1e-3) - 1.0)) < 0.06
 
 
-def test_light_is_taken_from_the_cache_and_traced_anew_where_that_is_broken(tmp_path: Path):
+def test_light_is_read_from_the_cache_and_traced_again_if_that_is_broken(tmp_path: Path):
     scene = Scene((FLOOR,), Sky(np.ones((16, 32, 3), np.float32)))
     stages: list[int] = []
 

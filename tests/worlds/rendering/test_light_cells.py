@@ -58,7 +58,7 @@ def test_the_two_sides_of_a_panel_have_light_of_their_own():
     np.testing.assert_allclose(light_at(cells, middle, DOWN[None]), 0.1, rtol=1e-4)
 
 
-def test_a_spot_that_nobody_saw_has_the_light_around_it():
+def test_an_unsampled_spot_has_the_light_around_it():
     points = floor_points(20_000)
     outside = points[np.linalg.norm(points[:, :2], axis=1) > 0.3]
     cells = gathered(np.ones((len(outside), 3), np.float32), outside)

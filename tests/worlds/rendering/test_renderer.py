@@ -138,7 +138,7 @@ def test_principal_point_and_focal_length_are_exact():
         assert np.abs(middle - expected).max() < 0.02
 
 
-def test_light_is_seen_where_colours_are():
+def test_light_and_colours_have_the_same_pixels():
     """The path tracer and the colour rays use one camera: the border of a lit wall is at
     the right pixel."""
     wall = Surface(

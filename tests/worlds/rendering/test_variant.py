@@ -27,9 +27,7 @@ def test_unknown_variant_is_refused():
         variant.use_best_variant("llvm_hd")
 
 
-def test_a_file_that_is_no_library_is_passed_over_and_remembered(
-    tmp_path, monkeypatch, cache, capfd
-):
+def test_an_invalid_library_is_skipped_and_remembered(tmp_path, monkeypatch, cache, capfd):
     pytest.importorskip("mitsuba")
     bad = tmp_path / "libLLVM.so.99"
     bad.write_bytes(b"no library at all")

@@ -163,7 +163,7 @@ def test_cars_stand_on_their_wheels_and_keep_their_width(shape) -> None:
     assert high[1] <= shape.width / 2 + 0.17  # the mirrors
 
 
-def test_leaves_are_where_they_are_told() -> None:
+def test_leaves_are_at_the_given_places() -> None:
     rng = np.random.default_rng(1)
     centres = rng.uniform(-2, 2, (50, 3))
     mesh = leaves(rng, centres)

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import accumulate
 from pathlib import Path
+from typing import TypeVar
 
 from topoloc.errors import MapError
 from topoloc.mapping.validation import describe_failure
@@ -30,6 +31,8 @@ from topoloc.recordings.atomic import (
     short_name,
     wait_for_lock,
 )
+
+T = TypeVar("T")
 
 WaitCallback = Callable[[], None]
 """Called before waiting for another process that edits the map."""
@@ -138,7 +141,7 @@ def drop_kept_files(path: Path, newest: Path) -> Sequence[Path]:
     return used
 
 
-def select_kept(files: Sequence[Path], sizes: Sequence[int]) -> Sequence[Path]:
+def select_kept(files: Sequence[T], sizes: Sequence[int]) -> Sequence[T]:
     """Return those of the files, the newest first, that have at most `_MAX_BYTES` together. The
     newest is kept at any size."""
     return files[: max(1, sum(total <= _MAX_BYTES for total in accumulate(sizes)))]

@@ -64,7 +64,7 @@ def test_walk_there_and_back(walk: Path, tmp_path: Path, capsys: pytest.CaptureF
     lines = capsys.readouterr().out.splitlines()
     sizes = [int(line.split(":")[1].split()[0]) for line in lines if " nodes, " in line]
     assert "107 frames, 0 without a pose" in lines[-2]
-    assert 5 <= sizes[0] <= sizes[-1] <= sizes[0] + 3  # known walls become no new nodes
+    assert 5 <= sizes[0] <= sizes[-1] <= sizes[0] + 3  # mapped places get no new nodes
     assert find_map_damage(out) == []
     with TopoMetricMap.load(out) as topomap:  # the floor of this room is at z = -1.3
         first = topomap.summaries[0].world_from_cam

@@ -20,13 +20,13 @@ def making(recording: Path) -> MapJob:
     return MapJob((str(recording),), PoseOptions(), BuildConfig())
 
 
-def test_it_stays_where_it_is_sent(making: MapJob):
+def test_the_digest_survives_pickling(making: MapJob):
     assert (
         pickle.loads(pickle.dumps(making)).digest() == making.digest() == replace(making).digest()
     )
 
 
-def test_whatever_decides_changes_it(
+def test_each_input_changes_the_digest(
     making: MapJob, recording: Path, monkeypatch: pytest.MonkeyPatch
 ):
     poses = recording / "other.tum"
@@ -56,7 +56,7 @@ def test_no_such_recording(making: MapJob, tmp_path: Path):
         replace(making, recordings=(str(tmp_path / "nothing@0:5"),)).digest()
 
 
-def test_one_each(making: MapJob):
+def test_jobs_are_split_by_recording(making: MapJob):
     three = replace(making, recordings=("a", "b", "c"))
     assert [one.recordings for one in three.split_by_recording()] == [("a",), ("b",), ("c",)]
     given = [

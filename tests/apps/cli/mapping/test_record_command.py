@@ -95,7 +95,7 @@ def test_the_recording_before_stays(film: Path, tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_in_good_order(film: Path, tmp_path: Path, number: signal.Signals):
-    pipe = tmp_path / "endless"  # pictures that never end: MJPEG through a pipe
+    pipe = tmp_path / "endless"  # endless images: MJPEG through a pipe
     os.mkfifo(pipe)
     command = [
         sys.executable,
@@ -147,7 +147,7 @@ def test_signals_end_it_in_good_order(film: Path, tmp_path: Path, number: signal
         (("webcam", "--jpeg", "101"), 2, "from 1 to 100"),
     ],
 )
-def test_what_is_refused(
+def test_invalid_sources_are_refused(
     args: tuple[str, ...],
     status: int,
     said: str,
@@ -160,7 +160,7 @@ def test_what_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_pictures_that_are_not_two(film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_single_images_are_no_pairs(film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "SN7.conf").write_text(CONF.replace("VGA", "HD"))
     assert record("zed", tmp_path / "out", "--source", film, "--camera", tmp_path / "SN7.conf") == 1
     assert "no calibration of VGA" in capsys.readouterr().err

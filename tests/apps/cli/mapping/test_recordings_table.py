@@ -17,7 +17,7 @@ BUILT = Outcome(
 FAILED = Outcome("walks/yard", "yard", "failed", "walks/yard: no such file or folder")
 
 
-def test_a_line_each_where_nobody_looks(capsys: pytest.CaptureFixture[str]):
+def test_one_line_per_recording_without_a_terminal(capsys: pytest.CaptureFixture[str]):
     with recordings_table(["walks/hall", "walks/yard"]) as (show, is_live):
         assert not is_live
         show(0, JobProgress("nodes", 1, 5))
@@ -49,7 +49,7 @@ def test_one_table_on_a_terminal(monkeypatch: pytest.MonkeyPatch):
     assert "nodes 1/5" not in last
 
 
-def test_where_a_recording_is():
+def test_printed_states():
     there = Outcome("walks/hall", "hall", "there")
     said = [format_state(state) for state in (None, JobProgress("images", 2, 7), BUILT, there)]
     assert said == ["waits", "images 2/7", "built", "there already"]

@@ -14,7 +14,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.trajectory import Trajectory
 
 
-def test_slam_writes_a_trajectory_and_says_how_good_it_is(
+def test_slam_writes_a_trajectory_and_prints_its_quality(
     tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out, told = tmp_path / "room.tum", tmp_path / "room.json"
@@ -53,7 +53,7 @@ def test_single_pictures_are_refused(queries: Path, tmp_path: Path, complaint: C
     assert "single pictures only" in complaint("slam", queries, tmp_path / "x.tum")
 
 
-def test_photos_alone_are_no_map_and_what_the_errors_ask_for_makes_one(
+def test_photos_alone_are_refused_and_the_remedy_of_the_error_works(
     tiny_recording: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     photos, target = tmp_path / "photos", tmp_path / "x.topo"

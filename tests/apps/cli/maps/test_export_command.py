@@ -23,7 +23,9 @@ def refusals(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_no_name_says_needs_a_format(room_map: Path, tmp_path: Path, complaint: Complaint):
+def test_an_output_without_a_known_suffix_needs_a_format(
+    room_map: Path, tmp_path: Path, complaint: Complaint
+):
     assert "--format takes colmap, nerfstudio" in complaint(
         "export", room_map, tmp_path / "room.zip"
     )
@@ -38,7 +40,7 @@ def test_a_map_without_a_place_on_earth_makes_no_geojson(
     assert "topoloc georeference" in complaint("export", room_map, tmp_path / "room.geojson")
 
 
-def test_results_that_are_none(tmp_path: Path, refusals: Path, complaint: Complaint):
+def test_invalid_inputs_are_refused(tmp_path: Path, refusals: Path, complaint: Complaint):
     assert "none of 1 results has a pose" in complaint("export", refusals, tmp_path / "a.tum")
     broken = tmp_path / "broken.jsonl"
     broken.write_text('{"query": "a"}\n')

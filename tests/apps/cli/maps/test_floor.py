@@ -59,7 +59,7 @@ def test_floor_below_a_table_and_above_mirror_images():
 
 
 @pytest.mark.parametrize("seen", ["table", "nothing"])
-def test_what_is_no_floor(seen: str):
+def test_surfaces_that_are_no_floor(seen: str):
     rng = np.random.default_rng(2)
     table = area(rng, (0, 2, 0.7), (1.6, 2.9, 0.7), 400)
     clutter = area(rng, (-2, 1, 0), (2, 5, 1.2), 1500)

@@ -119,7 +119,7 @@ def test_three_known_points(own_map: Path, tmp_path: Path):
     assert own_map.read_bytes() == placed_before
 
 
-def test_what_does_not_say_where_the_map_lies(own_map: Path, tmp_path: Path, complaint: Complaint):
+def test_invalid_inputs_are_refused(own_map: Path, tmp_path: Path, complaint: Complaint):
     file = tmp_path / "bad.csv"
     assert "one of --origin" in complaint("georeference", own_map, status=2)
     assert "four numbers" in complaint("georeference", own_map, "--origin", "1,2,3")

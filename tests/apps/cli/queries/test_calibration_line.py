@@ -16,7 +16,7 @@ def numbers(scale: float) -> str:
 
 
 @pytest.mark.parametrize("scale", [0.95, 1.05])
-def test_a_wrong_focal_length_is_said_once(
+def test_a_wrong_focal_length_is_reported_once(
     room_map: Path, queries: Path, scale: float, capsys: pytest.CaptureFixture[str]
 ):
     assert main(["localize", str(room_map), str(queries), "--camera", numbers(scale)]) == 0
@@ -26,7 +26,7 @@ def test_a_wrong_focal_length_is_said_once(
     assert f"the calibration {scale * CAMERA.fx:.1f}" in said
 
 
-def test_a_right_one_is_not_accused(
+def test_a_right_calibration_is_not_reported(
     room_map: Path, queries: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert main(["localize", str(room_map), str(queries)]) == 0

@@ -114,7 +114,7 @@ def test_one_picture_of_another_shape_in_a_list(
         (["--camera", "nowhere.yaml"], 1, "nowhere.yaml: no calibration here"),
     ],
 )
-def test_what_is_refused(
+def test_invalid_cameras_are_refused(
     options: list[str],
     status: int,
     says: str,

@@ -66,7 +66,7 @@ def turned_half(x: float, y: float, z: float, w: float) -> tuple[float, float, f
     return (-y, x, w, -z)
 
 
-def test_nothing_is_written_where_nothing_is_to_be_explained(
+def test_no_transform_is_written_without_errors_to_explain(
     room_map: Path, queries: Path, tmp_path: Path, complaint: Complaint
 ):
     fit = tmp_path / "fit.json"
@@ -96,7 +96,7 @@ def test_the_lab_of_the_zed_minutes_later(
         assert row == pytest.approx(other, abs=0.02)
 
 
-def test_truth_of_another_convention_is_read_as_told(
+def test_truth_in_another_convention_is_converted(
     room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     inverse, out = tmp_path / "inverse", tmp_path / "a.json"

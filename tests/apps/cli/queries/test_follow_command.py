@@ -54,7 +54,7 @@ def test_a_camera_that_runs_is_followed_until_it_ends(
     assert before_ns < answers[0]["t_ns"] <= answers[-1]["t_ns"] < time.time_ns()
 
 
-def test_it_ends_when_it_is_told_to(room_map: Path, tiny_recording: Path, tmp_path: Path):
+def test_it_stops_on_a_signal(room_map: Path, tiny_recording: Path, tmp_path: Path):
     """The stream would last for minutes: two thousand images, the same four again and again."""
     pictures = sorted((tiny_recording / "image_0").iterdir())[:4]
     for number in range(2000):
@@ -83,7 +83,7 @@ def test_it_ends_when_it_is_told_to(room_map: Path, tiny_recording: Path, tmp_pa
     assert len(lines) < 1000
 
 
-def test_what_cannot_be_followed_is_one_line(complaint: Callable[..., str], room_map: Path):
+def test_invalid_sources_are_one_line(complaint: Callable[..., str], room_map: Path):
     assert "no such camera or stream" in complaint("follow", room_map, "/dev/video77")
     assert "ros:/a b: no topic of ROS" in complaint("follow", room_map, "ros:/a b")
 

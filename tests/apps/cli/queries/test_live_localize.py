@@ -41,7 +41,7 @@ def test_the_newest_pictures_are_localized(
     lines = [json.loads(line) for line in results.read_text().splitlines()]
     assert f"{url} ended after 12 images, {len(lines)} were localized" in printed.err
     assert len(lines) >= 3
-    assert lines[-1]["query"] == "000011"  # the last picture is never left out
+    assert lines[-1]["query"] == "000011"  # the last image is never dropped
     assert all(line["localized"] for line in lines)
     assert ("state" in lines[0]) is not bool(options)
     for line, pose in zip(lines, Trajectory.read(found).world_from_cam, strict=True):
@@ -65,7 +65,7 @@ def test_the_newest_pictures_are_localized(
         ),
     ],
 )
-def test_what_is_refused(
+def test_invalid_options_are_refused(
     room_map: Path, inputs: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
 ):
     assert main(["localize", str(room_map), *inputs]) == status

@@ -151,7 +151,7 @@ def test_a_broken_picture_is_predicted_and_the_stream_goes_on(
     assert all(line["localized"] for number, line in enumerate(lines) if number not in (6, 9))
 
 
-def test_streams_that_cannot_be_are_one_line(
+def test_invalid_streams_are_one_line(
     room_map: Path, stream: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     broken = Path(shutil.copytree(stream, tmp_path / "broken"))

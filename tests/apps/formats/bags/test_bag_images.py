@@ -87,7 +87,7 @@ def test_depth_in_millimetres_and_metres():
     )
 
 
-def test_compressed_depth_of_both_kinds():
+def test_compressed_depth_of_both_formats():
     units = np.array([[0, 1500], [3000, 2]], np.uint16)
     png = cv2.imencode(".png", units)[1].tobytes()
     packed = SimpleNamespace(
@@ -165,12 +165,12 @@ def test_depth_compressed_by_rvl():
         ({"encoding": "32FC1", "width": 1, "step": 4, "height": 2}, "are depth, not a picture"),
     ],
 )
-def test_what_is_no_picture(fields: dict[str, object], said: str):
+def test_invalid_images_are_refused(fields: dict[str, object], said: str):
     with pytest.raises(UnreadableImageError, match=said):
         decode_image(message(RED_TO_BLUE, "rgb8", **fields), "walk, /left at 3")
 
 
-def test_a_compressed_picture_that_is_none():
+def test_an_invalid_compressed_image_is_refused():
     with pytest.raises(UnreadableImageError, match="walk, /left at 3: not a picture"):
         decode_image(SimpleNamespace(format="jpeg", data=b"nothing"), "walk, /left at 3")
     with pytest.raises(UnreadableImageError, match="depth must be 16UC1"):

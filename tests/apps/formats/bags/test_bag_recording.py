@@ -87,7 +87,7 @@ def test_a_bag_is_the_recording_it_was_made_of(
 
 
 @pytest.mark.parametrize("poses", [by_tf, by_odometry, by_pose])
-def test_poses_come_from_what_there_is(
+def test_poses_come_from_the_available_topics(
     poses: Callable[[Write, int, Rigid3], None], walk: StereoSequence, bag_of: BagOf
 ):
     sequence = open_sequence(bag_of("ros2", poses=poses))
@@ -118,7 +118,7 @@ def _part(sequence: StereoSequence, part: range) -> StereoSequence:
     return sequence_subset(sequence, list(part))
 
 
-def test_said_topics_override_the_guess(walk: StereoSequence, bag_of: BagOf):
+def test_given_topics_override_the_guess(walk: StereoSequence, bag_of: BagOf):
     path = bag_of("ros2")
     swapped = {"left": RIGHT, "right": "none", "pose": "none"}
     sequence = open_sequence(path, topics=swapped)
@@ -171,7 +171,7 @@ def test_poses_between_those_of_the_bag_are_interpolated(tmp_path: Path):
     assert sequence[0].camera == CAMERA
 
 
-def test_where_tf_does_not_reach_the_camera_odometry_does(walk: StereoSequence, tmp_path: Path):
+def test_odometry_is_used_if_tf_does_not_reach_the_camera(walk: StereoSequence, tmp_path: Path):
     def poses(write: Write, t_ns: int, world_from_cam: Rigid3) -> None:
         by_odometry(write, t_ns, world_from_cam)
         write(
@@ -266,7 +266,7 @@ def test_depth_with_its_own_camera(tmp_path: Path):
     assert as_monocular(sequence)[2].depth is None
 
 
-def test_pictures_without_a_partner_are_left_out_and_said(walk: StereoSequence, tmp_path: Path):
+def test_images_without_a_partner_are_dropped_and_reported(walk: StereoSequence, tmp_path: Path):
     def without(number: int, delay_ns: int = 0) -> StereoSequence:
         path = tmp_path / f"without{number}_{delay_ns}"
         with bag_writer(path, "ros2") as write:
@@ -307,7 +307,7 @@ def test_pictures_without_a_partner_are_left_out_and_said(walk: StereoSequence, 
         without(9, 20_000_000)
 
 
-def test_what_is_missing_is_said_with_what_there_is(
+def test_a_missing_topic_is_named_with_the_existing_ones(
     bag_of: BagOf, tmp_path: Path, complaint: Callable[..., str]
 ):
     path = bag_of("ros2")
@@ -329,7 +329,7 @@ def test_what_is_missing_is_said_with_what_there_is(
         open_sequence(tmp_path / "none")
 
 
-def test_a_format_without_topics_says_so(tiny_recording: Path):
+def test_topics_of_a_format_without_them_are_refused(tiny_recording: Path):
     with pytest.raises(RecordingError, match="a recording of format kitti takes no topics"):
         open_sequence(tiny_recording, topics="left=/a")
 

@@ -63,7 +63,7 @@ def test_rectified_pictures_are_of_p():
     assert info(d=[0.1] * 5).camera(True) == Camera.pinhole(640, 480, 480.0, 480.0, 319.0, 239.0)
 
 
-def test_a_raw_pair_rectifies_as_its_calibration_says():
+def test_a_raw_pair_rectifies_as_its_calibration():
     """OpenCV's stereoRectify gives R and P of a rotated and shifted pair. The reader
     recovers the pair."""
     rotation, translation = exp_so3(np.array([0.01, -0.03, 0.02])), np.array([-0.12, 0.003, -0.002])
@@ -94,12 +94,12 @@ def test_a_raw_pair_rectifies_as_its_calibration_says():
         {"r": np.ones(9), "k": np.ones(8)},
     ],
 )
-def test_what_is_no_calibration(fields: dict[str, Any]):
+def test_invalid_calibrations_are_refused(fields: dict[str, Any]):
     with pytest.raises(CalibrationError, match="/info: no calibration"):
         info(**fields)
 
 
-def test_models_that_are_not_known():
+def test_unknown_models_are_refused():
     with pytest.raises(CalibrationError, match="distortion_model 'thin_prism' of 12 coefficients"):
         info(distortion_model="thin_prism", d=[0.1] * 12).camera(False)
     with pytest.raises(

@@ -33,7 +33,7 @@ def test_a_bag_that_was_cut_off(
         np.testing.assert_array_equal(sequence[index].image, walk[index].image)
 
 
-def test_the_command_says_that_a_bag_was_cut_off(
+def test_the_command_reports_a_truncated_bag(
     file_of: FileOf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     from topoloc.apps.cli.output import open_recording
@@ -101,7 +101,7 @@ def test_a_topic_whose_name_is_damaged_is_not_shown(file_of: FileOf):
 
 
 @pytest.mark.parametrize("kind", FEATURE_TYPES)
-def test_changed_bytes_raise_errors_of_this_house_alone(kind: str, file_of: FileOf, tmp_path: Path):
+def test_changed_bytes_raise_only_topoloc_errors(kind: str, file_of: FileOf, tmp_path: Path):
     """Change bytes outside of image data, mostly in lengths."""
     path = file_of(kind)
     whole = path.read_bytes()

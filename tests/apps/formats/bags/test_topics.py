@@ -139,7 +139,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_drivers_record(name: str):
+def test_topics_of_common_drivers(name: str):
     its, expected = CASES[name]
     assert roles_of(its) == expected
 
@@ -157,7 +157,7 @@ def test_rectified_by_name(name: str, expected: bool):
     assert is_rectified(name) == expected
 
 
-def test_several_cameras_are_said():
+def test_several_cameras_are_reported():
     its = bag(image=["/front/image_raw", "/rear/image_raw"], info=["/rear/camera_info"])
     assert select_topics(its, {}).left == "/rear/image_raw"
     assert (
@@ -166,7 +166,7 @@ def test_several_cameras_are_said():
     )
 
 
-def test_what_is_said_counts():
+def test_given_topics_are_used():
     its = bag(
         image=["/cam0/image_raw", "/cam1/image_raw", "/depth"], info=["/k"], odometry=["/odom"]
     )
@@ -189,7 +189,7 @@ def test_what_is_said_counts():
 
 
 @pytest.mark.parametrize("text", ["left", "left=", "=/a", "left=/a,,", "lft=/a"])
-def test_topics_that_are_not_said_right(text: str):
+def test_wrong_topics_are_refused(text: str):
     with pytest.raises(RecordingError, match="topics"):
         parse_topics(text)
     assert parse_topics("image=/a, info = /b") == {"left": "/a", "left_info": "/b"}

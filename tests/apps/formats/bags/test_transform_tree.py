@@ -54,7 +54,7 @@ def test_a_camera_at_the_end_of_a_chain():
     assert not tree.is_moving("nowhere")
 
 
-def test_fixed_transforms_meet_below_what_moves():
+def test_fixed_transforms_meet_below_moving_frames():
     tree = robot()
     right_from_left = tree.find_static_transform("right", "left")
     assert right_from_left is not None
