@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         NetworkInfo as NetworkInfo,
         cache_folder as cache_folder,
     )
+    from topoloc.features.onnx_runtime import find_telemetry as find_telemetry
     from topoloc.json_data import Finite as Finite, decode_json as decode_json
     from topoloc.localization.query import Deadline as Deadline
     from topoloc.recordings.atomic import (
@@ -114,6 +115,7 @@ _NAMES = {
     ),
     "topoloc.features.features": "Features",
     "topoloc.features.network_files": "NetworkInfo cache_folder",
+    "topoloc.features.onnx_runtime": "find_telemetry",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (

@@ -255,6 +255,8 @@ def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
             replace_file(kept[0], edit.path)
         except OSError as error:
             raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
+        with suppress(OSError):  # no handle is left: the file is in place
+            fsync(edit.path.parent)
     return last
 
 

@@ -19,6 +19,7 @@ import tyro
 import topoloc  # most names of it load OpenCV; `topoloc doctor` must run without
 from topoloc import MissingExtraError, TopolocError, plugin
 from topoloc.apps.cli import printable
+from topoloc.apps.report.plotting import load_matplotlib
 from topoloc.plugin import remove_stale_files, write_text
 
 
@@ -218,6 +219,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 def import_report_writer() -> Callable[..., None]:
     """Return `write_report`. Raises MissingExtraError if the extra `report` is not installed."""
     with MissingExtraError.on_import("a report needs matplotlib", "report"):
+        load_matplotlib()
         from topoloc.apps.report.report import write_report
 
         return write_report
