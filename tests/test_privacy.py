@@ -1,0 +1,125 @@
+"""Nothing leaves the machine: commands as a user types them look up no name, connect to this
+machine alone, and write outputs and our own cache only (docs/privacy.md)."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+import topoloc
+from topoloc.apps.viewer import page as viewer_page
+from topoloc.demo.recordings import SHIPPED
+from traced import Traced, assert_quiet
+
+LAP, DAY = f"{SHIPPED / 'map_lap1'}@0:6", SHIPPED / "day"
+IMAGE = DAY / "images" / "000000.jpg"
+COMMANDS = {
+    "build": ("build", LAP, "new.topo"),
+    "slam": ("slam", LAP, "lap.tum"),
+    "localize": ("localize", "lab.topo", f"{DAY}@0:1", "--json", "poses.jsonl"),
+    "update": ("update", "lab.topo", f"{SHIPPED / 'map_lap2'}@0:2"),
+    "evaluate": ("evaluate", "lab.topo", f"{DAY}@0:1", "--report", "report.html"),
+    "explain": ("explain", "lab.topo", f"{DAY}@0", "--out", "page.html"),
+    "export": ("export", "lab.topo", "colmap", "--format", "colmap"),
+    "view": ("view", "lab.topo", "--out", "scene.html"),
+    "doctor": ("doctor",),
+}
+TRAIN = ("train", "lab.topo", "--coarse", "vlad-nn", "--backbone", "compact")
+# Chromium's question to the kernel which route leads there; as UDP it sends no packet.
+ROUTE = "connect 2001:4860:4860::8888 443"
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A map with all feature types, so that networks run."""
+    path = tmp_path_factory.mktemp("lab") / "lab.topo"
+    topoloc.build_map(topoloc.open_sequence(LAP)).save(path)
+    return path.read_bytes()
+
+
+@pytest.fixture
+def traced(tmp_path: Path, lab: bytes) -> Traced:
+    traced = Traced.in_folder(tmp_path)
+    (traced.folder / "lab.topo").write_bytes(lab)
+    return traced
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_is_quiet(traced: Traced, name: str):
+    traced.run(*COMMANDS[name])
+    assert_quiet(traced)
+
+
+def test_training_is_quiet(traced: Traced):
+    pytest.importorskip("torch", reason="torch is not installed (the extra deep)")
+    traced.run(*TRAIN, "--weights", "scratch")
+    assert_quiet(traced)
+
+
+def test_a_screenshot_is_quiet(traced: Traced):
+    try:
+        viewer_page.find_browser()
+    except topoloc.TopolocError as error:
+        pytest.skip(str(error))
+    traced.run("view", "lab.topo", "--screenshot", "lab.png")
+    assert_quiet(traced, allowed=[ROUTE])
+
+
+def test_a_temporary_cluster_is_quiet(tmp_path: Path):
+    pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
+    traced = Traced.in_folder(tmp_path)
+    recordings = [f"{SHIPPED / name}@0:4" for name in ("map_lap1", "map_lap2")]
+    traced.run("build", *recordings, "campus", "--ray", "local")
+    assert_quiet(traced)
+
+
+def test_a_served_request_is_quiet(traced: Traced):
+    process = subprocess.Popen(
+        traced.command("serve", "lab.topo", "--port", 0, detached=True),
+        cwd=traced.folder,
+        env=traced.environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    try:
+        lines = iter(process.stderr.readline, "")
+        url = next(one[1] for line in lines if (one := re.search(r"serves on (\S+)", line)))
+        with topoloc.Client(url) as client:
+            found = client.localize(IMAGE.read_bytes(), camera=str(DAY / "camera.json"))
+        assert found is not None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+        process.stderr.close()
+    deadline = time.monotonic() + 20  # the tracer writes on for a moment
+    while "+++ exited" not in traced.trace.read_text(errors="replace")[-200:]:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert_quiet(traced)
+
+
+def test_a_look_up_and_a_foreign_file_are_seen(tmp_path: Path):
+    """What the others assert can fail."""
+    traced = Traced.in_folder(tmp_path)
+    code = (
+        "import os, pathlib, socket; (pathlib.Path.home() / 'id').touch();"
+        " pathlib.Path(os.environ['ELSEWHERE']).touch();"
+        " socket.socket(type=socket.SOCK_DGRAM).connect(('192.0.2.1', 53))"
+    )
+    command = traced.command()
+    del command[-2:]
+    elsewhere = tmp_path / "elsewhere"
+    subprocess.run(
+        [*command, "-c", code],
+        env=traced.environment | {"ELSEWHERE": str(elsewhere)},
+        check=True,
+    )
+    assert traced.addresses() == ["connect 192.0.2.1 53"]
+    assert traced.foreign_files() == ["home/id", str(elsewhere)]
