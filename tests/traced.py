@@ -43,7 +43,6 @@ class Traced:
         """Make the folders. Skips the test if no process can be traced."""
         if reason := _find_reason():
             pytest.skip(reason)
-        # Short names: sockets lie in the folder for temporary files.
         made = Traced(*(base / name for name in ("home", "tmp", "out")))
         for folder in (made.home, made.temporary, made.folder):
             folder.mkdir(parents=True)
@@ -132,6 +131,8 @@ def _find_reason() -> str | None:
     if shutil.which("strace") is None:
         return "strace is not installed"
     tried = subprocess.run(
-        ["strace", "-f", "--seccomp-bpf", "-o", os.devnull, "true"], capture_output=True, check=False
+        ["strace", "-f", "--seccomp-bpf", "-o", os.devnull, "true"],
+        capture_output=True,
+        check=False,
     )
     return f"strace fails: {tried.stderr.decode()[-200:]}" if tried.returncode else None
