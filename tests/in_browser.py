@@ -89,6 +89,11 @@ def opened(browser: Any, address: str, width: int, dark: bool = False) -> Iterat
 
 
 def _is_elsewhere(url: str, address: str) -> bool:
+    """Whether a page loads something that is neither in itself nor of its service."""
+    if address.startswith("file:"):
+        return url.partition("#")[0] != address.partition("#")[0] and not url.startswith(
+            ("data:", "blob:")
+        )
     return not url.startswith(
         ("data:", "blob:", address.split("/", 3)[0] + "//" + address.split("/", 3)[2])
     )

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 
 import topoloc
+from in_browser import chromium, opened
+from topoloc.apps.cli import main
 from topoloc.apps.viewer import page as viewer_page
 from topoloc.demo.recordings import SHIPPED
 from traced import Traced, assert_quiet
@@ -69,6 +71,36 @@ def test_a_screenshot_is_quiet(traced: Traced):
         pytest.skip(str(error))
     traced.run("view", "lab.topo", "--screenshot", "lab.png")
     assert_quiet(traced, allowed=[ROUTE])
+
+
+PAGES = {
+    "report": (*COMMANDS["evaluate"][:3], "--report"),
+    "weak parts": ("evaluate", "lab.topo", "--against-itself", "--report"),
+    "explanation": (*COMMANDS["explain"][:3], "--out"),
+    "scene": ("view", "lab.topo", "--out"),
+}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_loads_nothing_from_elsewhere(
+    name: str, lab: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("lab.topo").write_bytes(lab)
+    assert main([*PAGES[name], "page.html"]) == 0
+    with chromium() as browser, opened(browser, (tmp_path / "page.html").as_uri(), 1300) as page:
+        page.wait_for_load_state("networkidle")
+
+
+def test_a_page_that_loads_from_elsewhere_is_seen(tmp_path: Path):
+    (tmp_path / "page.html").write_text("<link rel=icon href=data:,><img src=other.png>")
+    address = (tmp_path / "page.html").as_uri()
+    with (
+        chromium() as browser,
+        pytest.raises(AssertionError, match=r"other\.png"),
+        opened(browser, address, 400) as page,
+    ):
+        page.wait_for_load_state("networkidle")
 
 
 def test_a_temporary_cluster_is_quiet():
