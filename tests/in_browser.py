@@ -84,7 +84,7 @@ def opened(browser: Any, address: str, width: int, dark: bool = False) -> Iterat
     )
     page.goto(address)
     yield page
-    assert [error for error in errors if "GPU stall" not in error] == []
+    assert [error for error in errors if "GPU stall" not in error] == [], errors
     page.close()
 
 

@@ -121,8 +121,10 @@ class Traced:
 
 def assert_quiet(traced: Traced, allowed: Sequence[str] = ()) -> None:
     """Assert that nothing left the machine and that no foreign file appeared."""
-    assert [one for one in traced.addresses() if one not in allowed] == []
-    assert traced.foreign_files() == []
+    addresses = [one for one in traced.addresses() if one not in allowed]
+    assert addresses == [], addresses
+    files = traced.foreign_files()
+    assert files == [], files
 
 
 @cache
