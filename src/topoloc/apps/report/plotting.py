@@ -28,17 +28,21 @@ def load_matplotlib() -> None:
 @contextmanager
 def _writable_folder() -> Iterator[Path]:
     """Yield a folder within the cache folder, or else a temporary one."""
+    if folder := _find_cache():
+        yield folder
+    else:
+        with temporary_folder("topoloc-fonts-") as temporary:
+            yield temporary
+
+
+def _find_cache() -> Path | None:
+    """Return the folder within the cache folder, None if it cannot be written."""
     try:
         folder = cache_folder() / "matplotlib"
         folder.mkdir(parents=True, exist_ok=True)
-        is_writable = os.access(folder, os.W_OK)
     except (OSError, RuntimeError):  # the latter: the user has no home folder
-        is_writable = False
-    if is_writable:
-        yield folder
-    else:
-        with temporary_folder("topoloc-fonts-") as folder:
-            yield folder
+        return None
+    return folder if os.access(folder, os.W_OK) else None
 
 
 @contextmanager
