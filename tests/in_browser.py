@@ -83,11 +83,16 @@ def opened(browser: Any, address: str, width: int, dark: bool = False) -> Iterat
     )
     page.goto(address)
     yield page
-    assert [error for error in errors if "GPU stall" not in error] == []
+    assert [error for error in errors if "GPU stall" not in error] == [], errors
     page.close()
 
 
 def _is_elsewhere(url: str, address: str) -> bool:
+    """Whether a page loads something that is neither in itself nor of its service."""
+    if address.startswith("file:"):
+        return url.partition("#")[0] != address.partition("#")[0] and not url.startswith(
+            ("data:", "blob:")
+        )
     return not url.startswith(
         ("data:", "blob:", address.split("/", 3)[0] + "//" + address.split("/", 3)[2])
     )

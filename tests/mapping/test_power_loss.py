@@ -122,6 +122,7 @@ def test_a_power_cut_leaves_the_map_before_or_after_an_edit(
             edit.commit(edit.topomap, name)
         files.append(path.read_bytes())
     undo_edit(path)
+    assert disk.pending == [], "the undo itself is on the disk"
     monkeypatch.undo()
     assert path.read_bytes() == files[1]
     assert len(disk.states) > 10

@@ -18,6 +18,7 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
+from topoloc.apps.report.plotting import load_matplotlib
 from topoloc.errors import TopolocError
 from topoloc.recordings.atomic import write_text
 from topoloc_paper.datasets import (
@@ -169,7 +170,8 @@ class Command:
 
     def _draw(self, bench: Bench, results: dict[str, object]) -> None:
         if self.part == "paper":
-            from topoloc_paper.page import write_page  # loads matplotlib
+            load_matplotlib()
+            from topoloc_paper.page import write_page
 
             write_page(bench, results)
 

@@ -12,6 +12,7 @@ from topoloc.evaluation.metrics import format_length as format_length
 from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
 from topoloc.features.feature_types import find_available_types as find_available_types
 from topoloc.features.network_files import NetworkInfo as NetworkInfo
+from topoloc.features.onnx_runtime import find_telemetry as find_telemetry
 from topoloc.localization.query import Deadline as Deadline
 from topoloc.recordings.atomic import (
     collect_written_paths as collect_written_paths,

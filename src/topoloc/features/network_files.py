@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import WeightsError
+from topoloc.features.onnx_runtime import load_onnxruntime
 
 FORMAT_VERSION = 1
 """Version of the contract for inputs and outputs (`topoloc_version` in the metadata)."""
@@ -153,8 +154,7 @@ def open_network(
         WeightsError: the file is unreadable, not ONNX, breaks the contract, or holds an unknown
             network.
     """
-    import onnxruntime
-
+    onnxruntime = load_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = num_threads

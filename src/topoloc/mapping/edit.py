@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from topoloc.mapping.storage.map_writing import replace_file
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.validation import describe_failure
-from topoloc.recordings.atomic import replace as rename
+from topoloc.recordings.atomic import fsync, replace as rename
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
@@ -109,6 +109,8 @@ def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
             rename(kept[0], edit.path)
         except OSError as error:
             raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
+        with suppress(OSError):  # no handle is left: the file is in place
+            fsync(edit.path.parent)
     return last
 
 

@@ -181,7 +181,7 @@ def test_a_teacher_runs_once_per_image(
     x, y = (np.round((pixels[0] + 0.5) / 4 - 0.5)).astype(int)
     stored = lessons.descriptors[1][:, y, x].astype(float)
     assert found[0] @ stored / np.linalg.norm(stored) > 0.98
-    monkeypatch.setattr(teaching, "onnxruntime", None)
+    monkeypatch.setattr(teaching, "load_onnxruntime", None)
     assert np.array_equal(learn(config.pictures, config.teacher, tmp_path).scores, lessons.scores)
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional
 
 from topoloc.features.network_files import NETWORKS, NetworkInfo
+from topoloc.features.onnx_runtime import load_onnxruntime
 from topoloc_training.net.network import TopolocNet
 from topoloc_training.networks.edgepoint2 import EdgePoint2
 from topoloc_training.networks.export import build_network, convert, export
@@ -51,7 +51,7 @@ def test_the_exported_network_answers_as_the_original(
     path = tmp_path / "network.onnx"
     export(original, path, {"topoloc_network": kind})
     assert NetworkInfo.of_file(path) == NETWORKS[kind]
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    session = load_onnxruntime().InferenceSession(str(path), providers=["CPUExecutionProvider"])
     for height, width in ((96, 160), (160, 64)):
         image = picture(height, width)
         answers = {
@@ -133,7 +133,7 @@ def test_published_weights_answer_as_published(shared: Path, tmp_path: Path):
         {"topoloc_network": "xfeat"},
     )
     runs = [
-        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        load_onnxruntime().InferenceSession(str(path), providers=["CPUExecutionProvider"])
         for path in (tmp_path / "xfeat.onnx", weights / "xfeat" / "xfeat_own_dyn.onnx")
     ]
     scores, descriptors = runs[0].run(None, {"image": image})

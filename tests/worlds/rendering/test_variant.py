@@ -15,6 +15,16 @@ def cache(tmp_path, monkeypatch) -> Path:
     return tmp_path / "cache" / "topoloc" / "llvm.json"
 
 
+def test_kernels_lie_in_our_cache_unless_the_user_names_a_folder(monkeypatch, cache):
+    monkeypatch.setenv("DRJIT_CACHE_DIR", "")
+    variant._keep_kernels()
+    assert os.environ["DRJIT_CACHE_DIR"] == str(cache.parent / "drjit")
+    assert (cache.parent / "drjit").is_dir()
+    monkeypatch.setenv("DRJIT_CACHE_DIR", "own")
+    variant._keep_kernels()
+    assert os.environ["DRJIT_CACHE_DIR"] == "own"
+
+
 def test_missing_mitsuba_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(MissingExtraError, match=r"pip install mitsuba"):

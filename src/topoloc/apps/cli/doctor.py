@@ -114,6 +114,14 @@ def _examine_caches() -> Found:
     return facts, [f"every process compiles for a minute: {text} folder"]
 
 
+def _examine_telemetry() -> Found:
+    """Return whether libraries send data about their use."""
+    state = core_names.find_telemetry()
+    remedy = "set ORT_DISABLE_TELEMETRY=1 before that import"
+    text = f"onnxruntime was imported before topoloc, and its telemetry is on; {remedy}"
+    return {"onnxruntime": state}, [text] if state == "on by an earlier import" else []
+
+
 def _examine_networks() -> Found:
     """Run each network that is here on a small picture."""
     facts, faults = dict[str, Any](), list[str]()
@@ -168,6 +176,7 @@ _PARTS: dict[str, Callable[[], Found]] = {
     "processor": _examine_processor,
     "extras": _examine_extras,
     "caches": _examine_caches,
+    "telemetry": _examine_telemetry,
     "networks": _examine_networks,
     "self_test": _examine_pipeline,
 }
@@ -189,6 +198,8 @@ def _describe(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         for one in folders:
             access = "writable" if one["writable"] else "read-only"
             yield f"cache of {name}", f"{one['path']}, {one['bytes'] / 1e6:.1f} MB, {access}"
+    for name, state in facts["telemetry"].items():
+        yield f"telemetry of {name}", state
     for name, one in facts["networks"].items():
         if one:
             yield f"network {name}", f"{one['path']}, SHA-256 {one['sha256'][:12]}..."

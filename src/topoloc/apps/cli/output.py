@@ -21,6 +21,7 @@ from topoloc import MissingExtraError, TopolocError
 from topoloc.apps import core_names
 from topoloc.apps.cli import printable
 from topoloc.apps.core_names import remove_stale_files
+from topoloc.apps.report.plotting import load_matplotlib
 from topoloc.plugin import write_text
 
 
@@ -220,6 +221,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 def import_report_writer() -> Callable[..., None]:
     """Return `write_report`. Raises MissingExtraError if the extra `report` is not installed."""
     with MissingExtraError.on_import("a report needs matplotlib", "report"):
+        load_matplotlib()
         from topoloc.apps.report.report import write_report
 
         return write_report

@@ -23,6 +23,7 @@ LOCAL, AUTO = "local", "auto"
 _CONNECT_TIMEOUT_S = 5.0
 _TEMP_PREFIX = "topoloc-ray-"  # short, for sockets lie in it
 _CONNECTED: list[str] = []
+_NETWORK_VARIABLE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _TOKEN_VARIABLES = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -55,6 +56,7 @@ def connect_to_cluster(address: str) -> Iterator[Any]:
         if address == LOCAL:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             at_end.enter_context(_create_token())
+            at_end.enter_context(_on_this_machine_only(ray))
             options |= {
                 "include_dashboard": False,
                 "_temp_dir": str(at_end.enter_context(temporary_folder(_TEMP_PREFIX))),
@@ -132,6 +134,28 @@ def _silence_stderr() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+
+
+@contextmanager
+def _on_this_machine_only(ray: Any) -> Iterator[None]:
+    """Let a temporary cluster use 127.0.0.1 alone, and no process of the dashboard.
+
+    With `include_dashboard=False` this process only prepares reports of usage. Even if these are
+    off, it connects to the metadata services of clouds. The variable is Ray's switch for clusters
+    of one machine, and its constant is the value that this process has read at import.
+    """
+    constants, node = ray._private.ray_constants, ray._private.node.Node
+    before = constants.ENABLE_RAY_CLUSTER, node.start_api_server
+    is_unset = _NETWORK_VARIABLE not in os.environ
+    if is_unset:
+        os.environ[_NETWORK_VARIABLE], constants.ENABLE_RAY_CLUSTER = "0", False
+    node.start_api_server = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        constants.ENABLE_RAY_CLUSTER, node.start_api_server = before
+        if is_unset:
+            os.environ.pop(_NETWORK_VARIABLE, None)
 
 
 @contextmanager

@@ -47,10 +47,13 @@ BROWSERS = (
 _BROWSER_OPTIONS = (
     "--headless=new",
     "--no-first-run",
+    "--disable-background-networking",
+    "--host-resolver-rules=MAP * ~NOTFOUND",  # it would look up its maker's services
     "--hide-scrollbars",
     "--use-angle=swiftshader",  # WebGL without a graphics card
     "--enable-unsafe-swiftshader",
 )
+_BROWSER_FOLDERS = ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
 _TIMEOUT_S, _VIRTUAL_MS = 120.0, 3_000
 
 
@@ -150,7 +153,13 @@ def write_screenshot(page: Path, out: Path) -> None:
             page.resolve().as_uri(),
         ]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=_TIMEOUT_S, check=False)
+            done = subprocess.run(
+                command,
+                capture_output=True,
+                timeout=_TIMEOUT_S,
+                check=False,
+                env=os.environ | dict.fromkeys(_BROWSER_FOLDERS, profile),
+            )
         except subprocess.TimeoutExpired:
             raise TopolocError(f"{browser} made no screenshot within {_TIMEOUT_S:g} s") from None
         if done.returncode or not picture.is_file():

@@ -10,9 +10,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import onnxruntime
 from jaxtyping import Float, Float32, Int8, UInt8
 
+from topoloc.features.onnx_runtime import load_onnxruntime
 from topoloc.recordings.format import list_images
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import read_image
@@ -71,6 +71,7 @@ def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
     paths = [str(path) for folder in folders for path in _listed(folder)]
     cache.mkdir(parents=True, exist_ok=True)
     lessons = _opened(cache, paths, [0.0] * len(paths), "w+")
+    onnxruntime = load_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(

@@ -8,6 +8,7 @@ process first, and the verdict is remembered.
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import json
 import os
@@ -21,6 +22,7 @@ from topoloc.errors import MissingExtraError, TopolocError
 
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
 _FORCE, _LIBRARY = "TOPOLOC_MITSUBA_VARIANT", "DRJIT_LIBLLVM_PATH"
+_KERNELS = "DRJIT_CACHE_DIR"
 _PLACES = (
     "/usr/lib/*-linux-gnu/libLLVM*",
     "/usr/lib/llvm-*/lib/libLLVM*",
@@ -58,6 +60,7 @@ def use_best_variant(force: str | None = None) -> str:
         MissingExtraError: Mitsuba is not installed.
         TopolocError: the variant asked for is unknown, or needs a libLLVM and none works.
     """
+    _keep_kernels()
     try:
         import mitsuba
     except ImportError:
@@ -148,6 +151,16 @@ def cache_folder() -> Path:
     home."""
     folder = os.environ.get("XDG_CACHE_HOME")
     return Path(folder or Path.home() / ".cache") / "topoloc"
+
+
+def _keep_kernels() -> None:
+    """Let Dr.Jit keep its compiled kernels in the cache folder, unless DRJIT_CACHE_DIR names
+    another; its own default is a folder in the user's home."""
+    with contextlib.suppress(OSError, RuntimeError):  # the latter: no home folder
+        if not os.environ.get(_KERNELS):
+            folder = cache_folder() / "drjit"
+            folder.mkdir(parents=True, exist_ok=True)
+            os.environ[_KERNELS] = str(folder)
 
 
 def _cache_file() -> Path:

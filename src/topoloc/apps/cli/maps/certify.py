@@ -37,6 +37,7 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.apps.cli.queries.evaluate import read_rigid
 from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.report.plotting import load_matplotlib
 
 Recordings = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -113,6 +114,7 @@ class Command:
 
 def _import_page_writer() -> Callable[..., None]:
     with MissingExtraError.on_import("a report needs matplotlib", "report"):
+        load_matplotlib()
         from topoloc.apps.report.certificate_page import write_certificate
 
         return write_certificate

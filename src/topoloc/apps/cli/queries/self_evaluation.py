@@ -15,6 +15,7 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 from topoloc.apps.cli.settings_file import read_settings, with_option
+from topoloc.apps.report.plotting import load_matplotlib
 
 
 def evaluate_map_itself(
@@ -52,6 +53,7 @@ def evaluate_map_itself(
 
 def _import_page_writer() -> Callable[..., None]:
     with MissingExtraError.on_import("a report needs matplotlib", "report"):
+        load_matplotlib()
         from topoloc.apps.report.weak_regions_page import write_weak_regions
 
         return write_weak_regions
