@@ -26,8 +26,8 @@ def weights_of_map(topomap: TopoMetricMap, backbone: BackboneName) -> Weights:
     similar.
 
     Raises:
-        TrainingError: the map has no cnn-fc, or one with another backbone, or one without any node of
-            the map.
+        TrainingError: the map has no cnn-fc, or one with another backbone, or one without any
+            node of the map.
         MapError: the cnn-fc is damaged.
     """
     model = topomap.first_layer.coarse_models.get(NAME)
