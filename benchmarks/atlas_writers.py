@@ -33,7 +33,7 @@ def write(where: str, path: str, writer: int, times: int) -> None:
 
 @contextmanager
 def place(folder: str, is_s3: bool) -> Iterator[str]:
-    """Where the atlas is to be."""
+    """Return the place of the atlas."""
     if not is_s3:
         yield str(Path(folder) / "atlas")
         return
