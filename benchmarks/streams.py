@@ -259,7 +259,7 @@ def report_trembling(
     truths: list[Rigid3],
     camera: list[Rigid3 | None] | None,
 ) -> None:
-    """Return the jitter beside the jitter of the ground truth, see above."""
+    """Print the jitter without the part due to the jitter of the ground truth, see above."""
     if camera is None:
         row(
             "the same without the trembling of the truth",
