@@ -1,12 +1,12 @@
-"""Robust PnP: time and success of topoloc against plain OpenCV, over the number of matches and the
-share of outliers.
+"""Compare robust PnP of topoloc and plain OpenCV: time and success over the number of matches and
+the share of outliers.
 
     python benchmarks/absolute_pose.py [--num-scenes 20] [--json FILE]
 
 Scenes are simulated: 752x480 pinhole, points 2 to 12 m away, 1 px of key point noise, stereo points
-with an uncertain depth. A scene is solved where the position is within 0.25 m and the rotation
-within 2 degrees. Times are the median over the scenes of the fastest of three calls, one thread,
-everything included from the matches to the pose (for topoloc: to its covariance, too).
+with an uncertain depth. A scene is solved if the position is within 0.25 m and the rotation within
+2 degrees. Times are medians over the scenes of the fastest of three calls, on one thread, from the
+matches to the pose (of topoloc also to its covariance).
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def run_jobs(
 
 
 def timed(job: str, workplace: Workplace) -> tuple[list[Figure], str, float]:
-    """Return what `measure` returns, and the seconds that it took."""
+    """Return the result of `measure`, and the seconds that it took."""
     start = time.perf_counter()
     return *measure(job, workplace), time.perf_counter() - start
 

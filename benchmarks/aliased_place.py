@@ -1,16 +1,15 @@
-"""An aliased place: a wall of equal panels, asked by single pictures and by a stream. What is asked
-beside what is measured.
+"""Measure an aliased place, a wall of equal panels, with single images and with a stream, beside
+the requirements.
 
     python benchmarks/aliased_place.py MAP_SEQ QUERY_SEQ [--seed N] [--json FILE]
 
-Recordings of the world `hospital` of one seed, as by `topoloc simulate hospital hospital_map
+Recordings show the world `hospital` of one seed, as by `topoloc simulate hospital hospital_map
 --spacing 0.3` and `topoloc simulate hospital hospital_ask --spacing 0.45 --lateral 0.15 --take 1
---mono`; with `--look -80` in both the camera sees little but the wall. Right is within 0.25 m and 5
-degrees, a panel off is wrong along the way by whole metres to within a quarter. A picture cannot be
-told apart where every column of it shows panels, by the plan of the place: no door, no corner. Such
-a one should be refused as ambiguous, with a right pose among its alternatives. The same pictures
-are then one stream: its poses are those that were localized or followed, from the first right one
-on.
+--mono`. With `--look -80` in both, the camera sees little but the wall. A pose is right within 0.25
+m and 5 degrees. It is a panel off if it is wrong along the corridor by whole metres to within a
+quarter. An image is ambiguous if, by the plan of the place, every column of it shows panels,
+without a door or a corner. It should be refused as ambiguous, with a right pose among its
+alternatives. Then the same images are one stream, whose poses count from the first right one on.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ MAX_METRES, MAX_DEGREES = 0.25, 5.0
 
 @dataclass(frozen=True)
 class Alone:
-    """Single pictures, by what became of them."""
+    """Hold the results of single images by category."""
 
     pictures: int
     right: int
@@ -155,8 +154,7 @@ def asked_as_stream(localizer: Localizer, frames: list[StereoFrame]) -> Streamed
 
 
 def alternatives(result: NotLocalized) -> list[Rigid3]:
-    """The poses that an ambiguous picture may have been taken at; none from a localizer that does
-    not tell them."""
+    """Return the alternative poses of an ambiguous image, empty if the localizer has none."""
     return [alternative.world_from_cam for alternative in getattr(result, "alternatives", ())]
 
 

@@ -1,5 +1,5 @@
-"""Fit the numbers for images that look aside: which votes are by chance, and how certain a pose is
-whose points lie in a small part of the image.
+"""Fit the numbers for images that look aside: the limit of votes by chance, and the certainty of a
+pose with points in a small part of the image.
 
     python benchmarks/aside_fits.py MAP_SEQ QUERY_SEQ ... [--elsewhere SEQ ...] [--kind topoloc-net]
 

@@ -1,13 +1,12 @@
-"""An atlas beside the maps that it is made of: what each tile alone localizes, and what the atlas
-makes of the same pictures.
+"""Compare an atlas with the maps of its tiles on the same images.
 
     python benchmarks/atlas.py ATLAS TILE=RECORDING ... [--elsewhere RECORDING ...] [--alike c1,c2]
     [--memory-mb 256] [--json FILE]
 
-Each picture is asked of its own tile's map alone and of the atlas, in turns, in one process.
-`--alike` names tiles of places that share things (two fittings of one building): an answer in
-another of them is counted apart, and held against the recording's truth. A picture of `--elsewhere`
-is asked of each tile's map alone, and of the atlas: its time is compared with the mean of theirs.
+Each image is localized in its own tile's map alone and in the atlas, in turns, in one process.
+`--alike` names tiles of similar places (two fittings of one building). An answer in another of them
+is counted apart, and compared with the recording's truth. An image of `--elsewhere` is localized in
+each tile's map alone, and in the atlas. Its time is compared with the mean of theirs.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ RIGHT_METRES = 0.5
 def asked(
     localizer: Localizer, alone: Localizer, tile_id: str, frame: StereoFrame, alike: set[str]
 ) -> dict[str, Any]:
-    """One picture asked of the map alone and of the atlas."""
+    """Localize one image in the map alone and in the atlas."""
     assert frame.camera is not None
     start = time.process_time()
     by_map = alone.localize(frame.image, frame.camera)
@@ -80,7 +79,7 @@ def asked(
 def asked_elsewhere(
     localizer: Localizer, alone: dict[str, Localizer], frame: StereoFrame
 ) -> dict[str, Any]:
-    """One picture of no tile asked of each map alone and of the atlas."""
+    """Localize one out-of-map image in each map alone and in the atlas."""
     assert frame.camera is not None
     ms_alone, poses = [], 0
     for one in alone.values():

@@ -1,13 +1,13 @@
-"""The coarse search of an atlas over more and more places: time, recall of exact search, memory,
-bytes, look-alikes; drawn.
+"""Measure and draw the coarse search of an atlas over the number of places: time, recall of exact
+search, memory, bytes, similar places.
 
     python benchmarks/atlas_index.py ATLAS [--sizes 1000 10000 100000 1000000] [--likeness 0.6 0.7
     0.8] [--figure FILE.png] [--json FILE]
 
-Places are made up with the statistics of true ones: each is a mix of two place vectors of the atlas
-with noise of their spread, brought to unit length; queries are places of it, turned away by as much
-as pictures of the same place are (`--likeness`, a cosine). The index is made by the atlas's own
-code, in a process of its own; another one opens it and asks, with one thread.
+Places are simulated with the statistics of real ones. Each is a mix of two place vectors of the
+atlas with noise of their spread, at unit length. Queries are such places, turned by the angle of
+images of the same place (`--likeness`, a cosine). The atlas's own code makes the index in a process
+of its own. Another process opens it and runs the queries, with one thread.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def nearest(places: Float16[np.ndarray, "n d"], asked: Float32[np.ndarray, "q d"
 def tiles_of(
     folder: Path, kind: str, dimension: int
 ) -> tuple[list[Tile], Callable[[Tile], GlobalDescriptors]]:
-    """Tiles of places that follow each other in the file, and what reads them."""
+    """Hold tiles of successive places in the file, and their reader."""
     row, vocabulary = 2 * dimension, shared_vocabulary(kind)
     assert vocabulary is not None
     size = (folder / "places").stat().st_size // row
@@ -163,7 +163,7 @@ def memory_mb() -> dict[str, float]:
 
 
 def opened(folder: Path, kind: str, dimension: int) -> tuple[AtlasIndex, dict[str, float]]:
-    """The index, with what opening it took."""
+    """Return the index, and the time and memory of opening it."""
     faiss.omp_set_num_threads(1)
     tiles, read = tiles_of(folder, kind, dimension)
     before, start = memory_mb(), time.perf_counter()
@@ -172,12 +172,12 @@ def opened(folder: Path, kind: str, dimension: int) -> tuple[AtlasIndex, dict[st
 
 
 def made(folder: Path, kind: str, dimension: int) -> dict[str, float]:
-    """What making the index takes."""
+    """Measure time and memory of making the index."""
     return opened(folder, kind, dimension)[1]
 
 
 def asked(folder: Path, kind: str, dimension: int) -> dict[str, Any]:
-    """What asking it takes, and what it finds."""
+    """Measure time, memory and recall of queries."""
     tiles, _ = tiles_of(folder, kind, dimension)
     multiply_rows(
         np.zeros((1, dimension), np.float32),
@@ -241,8 +241,8 @@ def asked(folder: Path, kind: str, dimension: int) -> dict[str, Any]:
 
 
 def recall_of_places(folder: Path, queries: dict[str, np.ndarray], likeness: str) -> float:
-    """The part of the true neighbours that is among as many that the shards name; all where there
-    are none."""
+    """Return the recall of the true neighbours in equally many candidates of the shards, 1 without
+    shards."""
     shards = sorted(
         (DescriptorShard.open(path) for path in (folder / "index").glob("*.index")),
         key=lambda shard: shard.tiles[0].tile_id,

@@ -59,7 +59,7 @@ NUM_PICTURES = (5, 10, 15, 20)
 def seen_with(
     localizer: Localizer, sequence: StereoSequence, every: int, case: Change
 ) -> tuple[list[IntrinsicsDeviation], Camera]:
-    """What each picture says, and the calibration that it was asked with."""
+    """Return the estimated camera of each image, and the calibration of the queries."""
     first = sequence[0].camera
     assert first is not None, "a recording with a calibration is needed"
     camera = case.of(first)

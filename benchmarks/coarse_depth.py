@@ -92,7 +92,7 @@ def _topoloc(*arguments: str) -> None:
 
 
 def measure_points(map_path: Path, source: Path) -> list[str]:
-    """Return, for ranges of depth, what the points' depths are off by against exact depth."""
+    """Return, for ranges of depth, the errors of the points' depths against exact depth."""
     sequence, found = open_sequence(source), []
     rows = {name: row for row, name in enumerate(sequence.names)}
     for node in TopoMetricMap.load(map_path).nodes:

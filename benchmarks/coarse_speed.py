@@ -1,11 +1,11 @@
-"""Milliseconds of one picture through each coarse localizer, nearest neighbour included, on this
-machine's processor.
+"""Measure milliseconds of one image in each coarse localizer, with the nearest neighbour search, on
+this machine's processor.
 
     python benchmarks/coarse_speed.py [--threads 2] [--networks ...] [--size 224x224]
 
-Random weights: the time is the same. `wall` is the least and the median of the runs; `core` the
-least time of all cores together, which another program on the same machine disturbs less. What the
-processor offers is printed first.
+Weights are random, because they do not change the time. `wall` is the least and the median of the
+runs. `core` is the least time of all cores together, which other programs disturb less. The
+features of the processor are printed first.
 """
 
 from __future__ import annotations

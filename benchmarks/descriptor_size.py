@@ -1,20 +1,20 @@
-"""What do smaller descriptors cost, beside fewer landmarks of the same bytes?
+"""Compare smaller descriptors with fewer landmarks of the same bytes.
 
     python benchmarks/descriptor_size.py MAP QUERIES [--step 1] [--landmarks 60 120 240 10000]
     [--forms bytes coarse8 pq16 ...]
 
-The map keeps so many landmarks a node, as `topoloc prune` would choose them; their descriptors are
-then quantised and restored in memory, and every `step`-th picture of QUERIES (with truth in the
-map's world) is asked. Forms:
+The map keeps a number of landmarks a node, chosen as by `topoloc prune`. Their descriptors are
+quantised and restored in memory, and every `step`-th image of QUERIES (with truth in the map's
+world) is localized. Forms:
 
 - `bytes`: signed bytes, 1/200 a step, as map files have them;
 - `coarseN`: the same with steps N times as large, packed as map files pack them;
 - `pqN`: product quantisation to N bytes (Jegou et al. 2011), 256 words for each of N parts, learned
   from the map's own descriptors; the words are counted, too (256 descriptors in signed bytes a
-  kind);
+  feature type);
 - `binary`: signs of the numbers less their median over the map, one bit each.
 
-Printed for each: bytes of the map's file as it would be, of them descriptors, pictures localized
+Printed for each: bytes that the map's file would have, the share of descriptors, images localized
 and wrong (off by more than 0.5 m or 5 degrees), median errors and inliers.
 """
 

@@ -154,8 +154,8 @@ class Place:
         self._tmp.mkdir()
 
     def run(self, case: Case, limits: Limits) -> tuple[str, str, dict[str, bytes]]:
-        """Run a command. Return "ok", "refused" or "finding", a text, and the files after it. What
-        a command prints on standard error without limits is no error later."""
+        """Run a command. Return "ok", "refused" or "finding", a text, and the files after it. Lines
+        that the command prints on standard error without limits are no errors later."""
         for folder in (self.disk, self._tmp):
             _mount(folder, LARGE_KB)
         try:
@@ -238,7 +238,7 @@ def _find_fault(
     after: dict[str, bytes],
     left: list[str],
 ) -> str:
-    """Return what is wrong with the end of a command, "" if nothing is."""
+    """Return the fault at the end of a command, "" if there is none."""
     said = [line for line in lines if not line.startswith("warning: ")]
     if status not in (0, 1):
         return f"status {status}: {' '.join(said)[-300:]}"

@@ -1,14 +1,13 @@
-"""Does topoloc know when it is wrong? What is asked of uncertainty, ambiguity and other cameras,
-beside what is measured.
+"""Measure uncertainty, ambiguity and other cameras, beside the requirements.
 
     python benchmarks/honesty.py [--shared ../shared] [--rendered FOLDER] [--step 3] [--features
     surf|learned|both]
 
-The places are those of `real_recordings.py`, a map of the kitchen that holds only a third of it,
-and the demo's lab. FOLDER may hold recordings by `topoloc simulate`: `corridor_map`,
-`corridor_day`, `corridor_night`. `--step 3` asks every third query. Longer lenses are centre crops,
-enlarged to the size of the whole; shorter ones (x 0.6) are smaller pictures, for no picture holds
-more than was recorded; all with the intrinsics that follow.
+The places are those of `real_recordings.py`, a map of a third of the kitchen, and the demo's lab.
+FOLDER may hold recordings by `topoloc simulate`: `corridor_map`, `corridor_day`, `corridor_night`.
+`--step 3` localizes every third query. Longer focal lengths are centre crops, enlarged to the size
+of the whole. Shorter ones (x 0.6) are smaller images, because no image holds more than was
+recorded. All have the matching intrinsics.
 """
 
 from __future__ import annotations
@@ -233,7 +232,7 @@ def line(name: str, asked: Asked) -> str:
 
 
 def summary(groups: dict[str, Asked]) -> None:
-    """All places together, beside what is asked."""
+    """Print all places together, beside the requirements."""
 
     def of(kind: str, but: str = "nothing") -> list[Asked]:
         return [
@@ -295,8 +294,8 @@ def family_of(name: str) -> str:
 
 
 def calibration_error(probability: np.ndarray, y: np.ndarray, num_bins: int = 10) -> float:
-    """Expected calibration error: the mean distance of the probability told from the share that is
-    right."""
+    """Return the expected calibration error: the mean distance of the probability from the share of
+    right answers."""
     bins = np.minimum((probability * num_bins).astype(int), num_bins - 1)
     errors = [
         abs(probability[bins == k].mean() - y[bins == k].mean()) * np.mean(bins == k)

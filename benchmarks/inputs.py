@@ -1,13 +1,13 @@
-"""What topoloc answers for images as people hand them in: cropped, zoomed, with wrong EXIF data,
-through a lens that the calibration leaves out, panoramas.
+"""Measure answers for images as users have them: cropped, zoomed, with wrong EXIF data, with a
+distortion missing in the calibration, panoramas.
 
     python benchmarks/inputs.py [--shared ../shared] [--places lab,zed] [--situations NAMES]
         [--num 30] [--json FILE]
 
 Each situation is made from images with a known pose. An answer is right within 0.25 m and 2
-degrees. The row of a cropped image counts the right answers among those images whose whole image
-is answered right without a calibration. Rows "together" ask for all images of one camera, as
-`topoloc localize MAP photos/` does. `lab`, `kitchen` and `street1` served to choose the thresholds.
+degrees. The row of a cropped image counts the right answers among those images whose whole image is
+answered right without a calibration. Rows "together" localize all images of one camera, as `topoloc
+localize MAP photos/` does. `lab`, `kitchen` and `street1` served to choose the thresholds.
 """
 
 from __future__ import annotations

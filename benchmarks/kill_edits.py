@@ -38,7 +38,7 @@ from topoloc.mapping.storage.kept_files import find_kept_files
 
 
 def edit_without_end(path: Path) -> None:
-    """What the child does."""
+    """Edit the map without end, in the child process."""
     print("ready", flush=True)
     for k in range(100_000):
         with edit_map(path) as edit:
@@ -98,7 +98,7 @@ class KilledCommand:
         )
 
     def finished(self, folder: Path) -> KilledCommand:
-        """With what it leaves, and how long it takes, when nobody kills it."""
+        """Return the command with its output files and its duration if it is not killed."""
         self.prepare(folder)
         start = time.perf_counter()
         if self.start(folder).wait() != 0:

@@ -71,7 +71,7 @@ def match(first: Features, second: Features) -> tuple[np.ndarray, np.ndarray]:
 
 
 def disparity_map(frame: StereoFrame) -> np.ndarray:
-    """Of the left picture, pixels; below 1 where block matching finds none."""
+    """Return the disparity (pixels) of the left image, below 1 if block matching finds none."""
     matcher = cv2.StereoSGBM.create(
         0,
         64,
@@ -87,7 +87,7 @@ def disparity_map(frame: StereoFrame) -> np.ndarray:
 
 
 def day_points(frame: StereoFrame, disparity: np.ndarray, points_img: np.ndarray) -> np.ndarray:
-    """Points in the left camera, metres; NaN where there is no depth."""
+    """Return points in the left camera, metres, NaN without depth."""
     x, y = np.round(points_img).astype(int).T
     z = np.where(
         disparity[y, x] > 1,

@@ -51,7 +51,7 @@ class Cost:
 
 
 def run(*words: str | Path) -> Cost:
-    """A command of topoloc's in a process of its own. Ends the benchmark where it fails."""
+    """Run a command of topoloc in a process of its own. End the benchmark if it fails."""
     process = subprocess.Popen(
         [sys.executable, "-m", "topoloc", *map(str, words)],
         stdout=subprocess.DEVNULL,

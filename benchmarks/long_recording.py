@@ -1,12 +1,11 @@
-"""A long walk mapped in one piece: how do the memory and the time of `build` and of `slam` grow
-with its length?
+"""Measure memory and time of `build` and `slam` over the length of a recording.
 
     python benchmarks/long_recording.py [--metres 500 2000] [--lap METRES] [--step METRES] [--slam]
     [--features surf|both]
 
-The walk leads along a corridor that is bent to a ring, once around, or in laps of `--lap` metres;
-its stereo pairs are ray-cast when they are asked for, and their time is taken off. Each length is
-mapped in a process of its own. With `--slam` the trajectory is held against the truth, too.
+The walk follows a corridor in the shape of a ring, once around, or in laps of `--lap` metres. Its
+stereo pairs are ray-cast on access, and their time is subtracted. Each length is mapped in a
+process of its own. With `--slam` the trajectory is compared with ground truth, too.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def part_of_corridor(number: int) -> Float32[np.ndarray, "h w 2"]:
 
 @lru_cache(maxsize=1)
 def corridor_from(first: int, num_parts: int) -> Float32[np.ndarray, "h w 2"]:
-    """The part `first` and those after it, as far as is seen, in a ring of so many parts."""
+    """Return the part `first` and the visible parts after it, in a ring of `num_parts` parts."""
     return np.hstack(
         [
             part_of_corridor(number % num_parts)
@@ -91,8 +90,8 @@ def rays_cam() -> Float32[np.ndarray, "400 640 3"]:
 
 
 def picture(world_from_cam: Rigid3, num_parts: int, seed: int) -> UInt8[np.ndarray, "400 640"]:
-    """What a camera sees in the corridor, whose middle is a ring of so many parts around the
-    world's z axis."""
+    """Render the view of a camera in the corridor, whose centre line is a ring of `num_parts` parts
+    around the world's z axis."""
     radius = num_parts * PART_M / (2 * np.pi)
     x, y, z = world_from_cam.translation
     angle, at = np.arctan2(y, x), float(np.hypot(x, y))
@@ -140,8 +139,8 @@ def picture(world_from_cam: Rigid3, num_parts: int, seed: int) -> UInt8[np.ndarr
 
 @dataclass(eq=False)
 class Walk:
-    """Stereo pairs along so many metres of the corridor, which comes back to its beginning after
-    `lap` metres; a frame each `step`."""
+    """Hold stereo pairs along the corridor, which returns to its start after `lap` metres, with a
+    frame each `step` metres."""
 
     metres: float
     lap: float

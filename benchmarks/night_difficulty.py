@@ -34,7 +34,7 @@ ANY_POSE = EvidenceConfig(min_inliers=12, min_found=12, min_probability=0.0)
 
 @dataclass(frozen=True)
 class Method:
-    """What is asked, and with which features."""
+    """Hold the settings and the feature type of a method."""
 
     name: str
     features: FeatureConfig

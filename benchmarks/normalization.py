@@ -1,12 +1,12 @@
-"""Which normalisation of the picture gives the most right matches, in unchanged light and in the
-dark, on real recordings.
+"""Compare normalisations of images by right matches, in unchanged light and in the dark, on real
+recordings.
 
     python benchmarks/normalization.py [--shared ../shared] [--json FILE]
 
-The first picture of a pair is mapped (features with depth), the second is the query, as it is and
-with three kinds of light taken away. Its pose relative to the first comes from SIFT on the
-untouched pictures. A match is right where the map point falls within 3 pixels of the query's key
-point. Every variant may keep the same number of features.
+The first image of a pair is mapped (features with depth). The second is the query, unchanged and
+with three reductions of light. Its pose relative to the first comes from SIFT on the unchanged
+images. A match is right if the map point falls within 3 pixels of the query's key point. Every
+variant may keep the same number of features.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""A stereo recording written as what other programs write, mapped from that, and asked with another
-recording beside the stereo map.
+"""Write a stereo recording in formats of other programs, map these, and localize another recording
+in them, beside the stereo map.
 
     python benchmarks/other_formats.py RECORDING QUERIES [--map-from-truth FILE] [--formats
     nerfstudio colmap] [--out DIR]
 
 `nerfstudio`: transforms.json with depth of 16 bits by semi-global matching of the pairs. `colmap`:
 a model whose cameras and poses are those of the recording, whose points are triangulated by
-pycolmap from its own SIFT features; no depth, no right picture.
+pycolmap from its own SIFT features, without depth and right images.
 """
 
 from __future__ import annotations

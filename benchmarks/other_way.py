@@ -1,14 +1,13 @@
-"""The other way round: a way mapped in one direction, walked in the other. What is asked beside
-what is measured.
+"""Measure queries in reverse direction of a route mapped in one direction, beside the requirements.
 
     python benchmarks/other_way.py MAP_SEQ QUERY_SEQ [--json FILE]
 
-Recordings as by `topoloc simulate corridor corridor_map --laps 1` and
-`topoloc simulate corridor corridor_reverse --reverse --mono --take 6` (of a map of two laps take
-the first: `corridor_map@0:269`), with exact truth. A query sees something twice where at least 50
-map points that were seen from the other side lie in one of its views to the sides, as truth has it.
-Right is within 0.5 m and 5 degrees, far off beyond 0.5 m or 10 degrees. The same queries are asked
-without side nodes (`walls.num_places=0`) for comparison.
+Recordings are as by `topoloc simulate corridor corridor_map --laps 1` and `topoloc simulate
+corridor corridor_reverse --reverse --mono --take 6` (of a map of two laps take the first:
+`corridor_map@0:269`), with exact truth. A query shares content with the map if, by ground truth, at
+least 50 map points seen from the other side lie in one of its virtual views. An answer is right
+within 0.5 m and 5 degrees, far off beyond 0.5 m or 10 degrees. The same queries are localized
+without virtual views (`walls.num_places=0`) for comparison.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
-"""Is the right place among the first? Recall of the coarse search of a kind of features, where the
-light is another one.
+"""Measure recall of the coarse search of a feature type under another light.
 
     python benchmarks/place_recall.py --kinds surf topoloc-net --pairs MAPPED,ASKED --reach 1
     [--walks day_right,night_right]
 
-MAPPED and ASKED are recordings with truth (parts of one, `street1@0::2`, do as well): surf-vlad by
-each kind is learnt from all pictures of MAPPED, each being a node, and each picture of ASKED is put
-to it, also without the network's cells (`VLAD alone`). A hit is a mapped picture within `--reach`
-metres and 20 degrees; pictures of ASKED without one are left out. Walks are folders of
-`gardenspoint`, where pictures of equal numbers show the same place, but for a frame or two: a hit
-is the very frame, and, counted apart, one within two.
+MAPPED and ASKED are recordings with truth (also parts of one, `street1@0::2`). surf-vlad of each
+feature type is learned from all images of MAPPED, each of which is a node. Each image of ASKED is a
+query, also without the network's cells (`VLAD alone`). A hit is a mapped image within `--reach`
+metres and 20 degrees. Images of ASKED without such an image are left out. Walks are folders of
+`gardenspoint`, in which images of equal numbers show the same place to within a frame or two. A hit
+is the equal number, and, counted apart, one within two.
 """
 
 from __future__ import annotations
@@ -79,7 +78,7 @@ def learnt(mapped: Described, kind: str) -> SurfVlad:
 def judge(
     mapped: Described, asked: Described, kind: str, hits: list[tuple[str, np.ndarray]]
 ) -> None:
-    """`hits` (asked, mapped): which answers are right, by name."""
+    """Count right answers by name, with `hits` (asked, mapped)."""
     coarse = learnt(mapped, kind)
     ways = {
         "VLAD alone": [

@@ -1,12 +1,12 @@
-"""The ratio test where several map nodes show the same point: three rules compared on the kitchen
-of 7-Scenes.
+"""Compare three rules of the ratio test for points seen by several map nodes, on the kitchen of
+7-Scenes.
 
     python benchmarks/pooled_matching.py [--shared ../shared]
 
-Nodes are every tenth frame; a query is matched with the five nearest nodes but the two next to it.
-Right is a match whose map point falls within 4 pixels of the key point, under the pose that the
-matches of all rules together give. Printed are right matches, each key point of the query counted
-once (geometric mean), and precision.
+Nodes are every tenth frame. A query is matched with the five nearest nodes but the two next to it.
+A match is right if its map point falls within 4 pixels of the key point, under the pose from the
+matches of all rules together. Printed are right matches, each key point of the query counted once
+(geometric mean), and precision.
 """
 
 from __future__ import annotations

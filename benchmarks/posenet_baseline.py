@@ -1,12 +1,12 @@
-"""PoseNet against the deep-geometric localizer: median pose errors on the same images, and how many
-times smaller ours are.
+"""Compare PoseNet with the deep-geometric localizer: median pose errors on the same images, and
+their ratio.
 
     python benchmarks/posenet_baseline.py MAP --queries SEQ [SEQ ...] [--weights FILE] [--epochs 80]
     [--losses ...] [--rates ...]
 
-PoseNet is tuned as carefully as our own: every loss and learning rate below is trained on the map's
-images, and the one with the least mean D_total on the held-out images is asked. It answers every
-query; ours is judged by what it localizes, and its share is printed.
+PoseNet is tuned as carefully as our own networks: every loss and learning rate is trained on the
+map's images, and the network with the least mean D_total on the held-out images is used. It answers
+every query. Ours is evaluated on its localized queries, and their share is printed.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ def in_light(frame: StereoFrame, light: float) -> StereoFrame:
 
 
 def ask(localizer: Localizer, frame: StereoFrame) -> Answer:
-    """Return what is compared of one answer."""
+    """Return the compared values of one answer."""
     spent.clear()
     trace, start, busy = Trace(), time.perf_counter(), time.process_time()
     result = localizer.localize(frame.image, frame.camera, trace=trace)
@@ -203,7 +203,7 @@ def figures(rows: list[Answer]) -> str:
 
 
 def differences(before: list[Answer], now: list[Answer]) -> str:
-    """Return what differs between the answers of two trees."""
+    """Describe the differences between the answers of two trees."""
     lost = [k for k, (a, b) in enumerate(zip(before, now, strict=True)) if _is(a) > _is(b)]
     won = [k for k, (a, b) in enumerate(zip(before, now, strict=True)) if _is(a) < _is(b)]
     both = [(a, b) for a, b in zip(before, now, strict=True) if _is(a) and _is(b)]
@@ -220,7 +220,7 @@ def _is(answer: Answer) -> bool:
 
 
 def fit(path: str, recordings: list[str], light: float) -> None:
-    """Print what right poses show at each step."""
+    """Print the figures of right poses at each step."""
     localizer, inliers = Localizer(path), defaultdict[str, list[int]](list)
     right, wrong = defaultdict[str, list[int]](list), defaultdict[str, list[int]](list)
     for recording in recordings:

@@ -103,8 +103,8 @@ def load(
     rate: float | None = None,
     address: str = "127.0.0.1",
 ) -> tuple[float, list[float], Counter]:
-    """Pictures a second, seconds of each answer, and how often each status came; with a rate (1/s)
-    requests come as the clock says."""
+    """Return images a second, seconds of each answer, and counts by status. With a rate (1/s)
+    requests start at fixed times."""
     seconds, statuses, lock, start = list[float](), Counter(), threading.Lock(), time.perf_counter()
     waiting = iter(enumerate(pictures))
 
@@ -143,7 +143,7 @@ def in_process(
 
 
 def garbage(rng: random.Random, picture: bytes) -> bytes:
-    """What may come instead of a picture."""
+    """Return a damaged input instead of an image."""
     kinds = (
         b"",
         picture[: rng.randrange(1, len(picture))],

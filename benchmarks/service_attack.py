@@ -46,7 +46,7 @@ MAX_HEALTH_S, MAX_MB, MAX_GROWTH = 2.0, 500.0, 1.1
 
 @dataclass
 class Third:
-    """What clients met during a third of the requests."""
+    """Hold the counts of honest clients during a third of the requests."""
 
     statuses: Counter[str] = field(default_factory=Counter)
     health_s: list[float] = field(default_factory=list)
@@ -67,7 +67,7 @@ class Third:
 
 @contextmanager
 def watching(of: Service, third: Third) -> Iterator[None]:
-    """Ask for `/healthz` and measure memory twice a second."""
+    """Request `/healthz` and measure memory twice a second."""
     stop = threading.Event()
 
     def watch() -> None:
@@ -171,7 +171,7 @@ def make_requests(
 
 
 def find_faults(thirds: Sequence[Third]) -> list[str]:
-    """Return what the requirements forbid."""
+    """Return the violations of the requirements."""
     faults = list[str]()
     for number, third in enumerate(thirds, start=1):
         wrong = {key: k for key, k in third.statuses.items() if key[:1] not in "24"}

@@ -1,14 +1,14 @@
-"""Does it help to make little of what sets the place vectors of several lights apart? Recall of the
-coarse search before and after.
+"""Measure recall of the coarse search before and after differences of place vectors between lights
+are reduced.
 
     python benchmarks/session_light.py [--kinds surf topoloc-net]
 
-As maps grow: vocabulary and whitening are learnt from the first walk, the second one joins. Of
-`gardenspoint` (one path by day, beside it by day, and by night; pictures of equal numbers show the
-same place, a hit is within two) a night that covers the whole path, a quarter of it, or one half,
-where the other half is asked. Of the demo's lab (rendered) a day's lap and half of a night's
-pictures, the rest asked; a hit is within 30 cm and 20 degrees. Walks by one light are left as they
-are.
+As in growing maps, vocabulary and whitening are learned from the first walk, and the second one
+joins. `gardenspoint` is one path by day, beside it by day, and by night. Images of equal numbers
+show the same place, a hit is within two. The night covers the whole path, a quarter of it, or one
+half with queries in the other half. The demo's lab (rendered) has a day's lap and half of a night's
+images, and the rest are queries. A hit is within 30 cm and 20 degrees. Walks by one light stay
+unchanged.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ _FIRST = (1, 4, 16)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture as the coarse search sees it, with what says where it was taken: its number, or a
-    pose."""
+    """Hold an image's data for the coarse search, and its place: its number, or a pose."""
 
     features: Features
     size: tuple[int, int]

@@ -1,10 +1,10 @@
-"""Which transform between the Kinect's cameras fits 7-Scenes: how strong are the colour edges where
-depth edges fall?
+"""Compare transforms between the Kinect's cameras of 7-Scenes by the strength of colour edges at
+depth edges.
 
     python benchmarks/seven_scenes_registration.py PATH_OF_A_RUN
 
-A row is the mean gradient of the colour picture, over that of the whole picture, at the near side
-of every depth jump.
+A row is the mean gradient of the colour image, over that of the whole image, at the near side of
+every depth jump.
 """
 
 from __future__ import annotations

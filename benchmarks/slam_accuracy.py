@@ -40,7 +40,7 @@ from topoloc.slam.slam import run_slam
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording, and what is asked of SLAM on it."""
+    """Hold a recording, and the requirements of SLAM on it."""
 
     name: str
     path: str
@@ -200,8 +200,8 @@ def num_silent(truth: list[Rigid3 | None], worlds: list[list[Rigid3 | None]]) ->
 
 
 def gap_between_laps(truth: list[Rigid3], found: list[Rigid3]) -> float | None:
-    """Median over frames of a second lap: error of where they are relative to the nearest frame of
-    the first (metres)."""
+    """Return the median error (metres) of frames of a second lap, relative to the nearest frame of
+    the first."""
     positions = np.array([pose.translation for pose in truth])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     aligned = align_trajectories(truth, found)

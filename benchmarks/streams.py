@@ -189,7 +189,7 @@ def _camera(frame: StereoFrame):
 
 
 def warm_up(localizer: Localizer, frames: list[StereoFrame]) -> None:
-    """What is compiled on first use is no part of a frame."""
+    """Compile code that is compiled on first use, so that frames do not include it."""
     tracker = Tracker(localizer)
     for frame in frames[:8]:
         tracker.process(frame.image, _camera(frame), frame.t_ns)
@@ -211,8 +211,8 @@ def stream(
 
 
 def step_errors(poses: Sequence[Rigid3 | None], truths: Sequence[Rigid3 | None]) -> np.ndarray:
-    """Distance (metres) between the steps of both, of each frame from the one before; NaN where one
-    of the four poses is missing."""
+    """Return the distance (metres) between the steps of both, of each frame from the one before,
+    NaN if one of the four poses is missing."""
     errors = np.full(len(poses) - 1, np.nan)
     for k in range(1, len(poses)):
         before, after, truth_before, truth_after = poses[k - 1], poses[k], truths[k - 1], truths[k]
@@ -243,8 +243,8 @@ def share_inside(answers: list[StreamedPose], truths: list[Rigid3]) -> float:
 
 
 def motion_of_camera(pair: Pair) -> list[Rigid3 | None] | None:
-    """SLAM's pose of each streamed frame that has a truth, in a world of its own; None where there
-    are single pictures only."""
+    """Return SLAM's pose of each streamed frame with a ground truth, in a world of its own, or None
+    if there are single images only."""
     sequence = open_sequence(pair.streamed)
     first = sequence[0]
     if first.right is None and first.depth is None:
@@ -259,7 +259,7 @@ def report_trembling(
     truths: list[Rigid3],
     camera: list[Rigid3 | None] | None,
 ) -> None:
-    """Jitter where the truth is not what limits it; see above."""
+    """Print the jitter without the part due to the jitter of the ground truth, see above."""
     if camera is None:
         row(
             "the same without the trembling of the truth",

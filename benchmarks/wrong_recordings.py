@@ -39,7 +39,7 @@ from variants.wrong import Variant, wrong_variants
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the command printed, and what the map answers."""
+    """Hold the output of the command, and the answers of the map."""
 
     status: str
     message: str

@@ -17,7 +17,7 @@ ORIGIN = ("--origin", "50.8,4.7,30,0")
 
 
 def atlas(work: Workplace) -> Iterator[Figure]:
-    """Create, join and query an atlas; take one tile away and back; say where on earth it lies."""
+    """Create, join and query an atlas. Remove one tile and restore it. Georeference the answers."""
     first, second, where = (work.folder / name for name in ("first.topo", "second.topo", "atlas"))
     work.topoloc("build", work.data("zed_lab/session1@0:52"), first)
     work.topoloc("build", work.data("zed_lab/session1@40:88"), second)

@@ -123,7 +123,7 @@ class Committed:
 
 
 def rounded(number: float, digits: int = 4) -> float:
-    """Return a number with so many digits after the first that is not zero."""
+    """Return a number rounded to a number of significant digits."""
     return float(f"{number:.{digits}g}")
 
 

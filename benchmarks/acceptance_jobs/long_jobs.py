@@ -73,7 +73,7 @@ def test_slow(work: Workplace) -> Iterator[Figure]:
 
 
 def _of_script(work: Workplace, name: str, script: str, *words: object) -> Figure:
-    """Run a script of benchmarks/ and count what it found."""
+    """Run a script of benchmarks/ and count its findings."""
     command = [sys.executable, ROOT / "benchmarks" / script, *words]
     code, out, err = run(command, work.folder, timeout=500)
     counts = [

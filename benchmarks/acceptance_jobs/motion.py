@@ -23,7 +23,7 @@ def stream(work: Workplace) -> Iterator[Figure]:
 
 
 def slam(work: Workplace) -> Iterator[Figure]:
-    """Run SLAM without poses; also where frames are missing."""
+    """Run SLAM without poses, also on a recording with missing frames."""
     recordings = {
         "street1": "kitti/sequences/street1",
         "euroc": "euroc/v1_01_part",

@@ -137,7 +137,7 @@ class Workplace:
         return self.python("-m", "topoloc", *words, timeout=timeout, status=status)
 
     def answer(self, *words: object, timeout: float = 300) -> Any:
-        """Return what a command writes with `--json`: an object, or a list of the lines."""
+        """Return the JSON of a command with `--json`: an object, or a list of the lines."""
         path = self.folder / "answer.json"
         path.unlink(missing_ok=True)
         self.topoloc(*words, "--json", path, timeout=timeout)

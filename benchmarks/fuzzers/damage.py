@@ -82,7 +82,7 @@ def damage_bytes(data: bytes, rng: Rng) -> bytes:
 
 
 def _numbers(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield where runs of digits begin and end; of a text, words also."""
+    """Yield start and end of runs of digits, in a text also of words."""
     start = None
     for at, byte in enumerate(data[:20_000]):
         is_inside = bytes([byte]).isalnum() or byte in b".-"

@@ -56,7 +56,7 @@ class Fuzzer(Protocol):
         ...
 
     def damage(self, whole: Path, folder: Path, rng: np.random.Generator) -> tuple[str, Read]:
-        """Write a damaged input into an empty folder. Return its kind and what reads it. The same
+        """Write a damaged input into an empty folder. Return its kind and its reader. The same
         numbers give the same input."""
         ...
 

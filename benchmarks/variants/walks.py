@@ -177,8 +177,8 @@ def read_walk(name: str, data: Path, work: Path) -> Walk:
 
 
 def depth_mm(frame: StereoFrame) -> np.ndarray:
-    """Return the depth of the image in millimetres, 0 where unknown. That of stereo pairs is by
-    semi-global matching (Hirschmueller 2008, as OpenCV has it)."""
+    """Return the depth of the image in millimetres, 0 if unknown. Depth of stereo pairs is by
+    semi-global matching (Hirschmueller 2008, in OpenCV's version)."""
     view = prepare_frame(frame)
     if view.depth is not None:
         return np.rint(1000.0 * np.nan_to_num(view.depth)).astype(np.uint16)

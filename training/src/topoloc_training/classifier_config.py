@@ -65,7 +65,7 @@ class AugmentationConfig:
 
 @dataclass(frozen=True)
 class CnnFcConfig(ClassifierNetworkConfig):
-    """Settings of cnn-fc: a network whose outputs are the nodes."""
+    """Settings of cnn-fc: a network with one output for each node."""
 
     training: TrainingConfig = field(default_factory=lambda: TrainingConfig(max_epochs=40))
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)

@@ -114,8 +114,8 @@ def train(
 
 
 def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray, "n nodes"]:
-    """The share of each node in each image: a bell curve of how much farther than the nearest it
-    is; one node where `spread` is 0."""
+    """Return the share of each node in each image: a Gaussian of its distance beyond the nearest
+    node. If `spread` is 0, the nearest node has the whole share."""
     excess = training_set.node_distances - training_set.node_distances.min(axis=1, keepdims=True)
     if spread <= 0.0:
         shares = np.zeros_like(excess)
@@ -126,8 +126,8 @@ def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray,
 
 
 def calibrated_temperature(outputs: Tensor, labels: Tensor) -> float:
-    """What to divide the outputs by, so that the labels are as likely as can be (Guo et al. 2017):
-    golden section over its logarithm."""
+    """Return the temperature (divisor of the outputs) of maximum likelihood (Guo et al. 2017), by
+    golden section search over its logarithm."""
     low, high, ratio = float(np.log(0.05)), float(np.log(20.0)), (5.0**0.5 - 1.0) / 2.0
 
     def cost(log_temperature: float) -> float:
@@ -140,7 +140,7 @@ def calibrated_temperature(outputs: Tensor, labels: Tensor) -> float:
 
 
 def _outputs(network: NodeClassifier, maps: Tensor, num_frozen: int) -> Tensor:
-    """Of what the first layers, as many as are frozen, made of pictures."""
+    """Return the outputs for feature maps of the first `num_frozen` layers."""
     network.eval()
     with torch.inference_mode():
         return torch.cat(
@@ -162,8 +162,11 @@ def _freeze(network: NodeClassifier, num_tuned: int) -> nn.Sequential:
 
 
 def _load(network: NodeClassifier, weights: Weights) -> list[nn.Parameter]:
-    """Put in all weights that fit, which are all but the output layer's where they are not the
-    map's own; the parameters that got one, without those that learn at the full rate."""
+    """Load all fitting weights. The output layer fits only if the weights are the map's own.
+
+    Returns:
+        The loaded parameters, without the ones that learn at the full rate.
+    """
     parameters = {
         name.removeprefix("backbone."): value for name, value in network.named_parameters()
     }

@@ -14,11 +14,11 @@ from topoloc.retrieval.coarse import CoarseModel
 
 
 def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: bool) -> None:
-    """Write to `target`, which may be `path`, the map of `path` with this coarse localizer in it:
-    at once or not at all.
+    """Write the map of `path` with this coarse localizer to `target`, atomically. Both paths may be
+    equal.
 
     Args:
-        make_default: it answers from now on where the user names none.
+        make_default: make it the default coarse localizer of the map.
 
     Raises:
         MapError: `path` is no map, or `target` cannot be written.

@@ -41,10 +41,9 @@ def train_coarse(
     """Train the coarse localizer `name` (cnn-fc, cnn-nn or vlad-nn) for this map.
 
     Args:
-        weights: a file, ``scratch``, ``map`` for what the map's own cnn-fc knows, or None for the
-            published weights of the backbone.
-        checkpoint: cnn-fc writes its state here after each epoch, and goes on from it if it is
-            there.
+        weights: a file, ``scratch``, ``map`` for the weights of the map's own cnn-fc, or None for
+            the published weights of the backbone.
+        checkpoint: cnn-fc writes its state here after each epoch, and resumes from it if it exists.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.

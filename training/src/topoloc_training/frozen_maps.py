@@ -1,5 +1,5 @@
-"""What the frozen layers of a network make of the mapping pictures, computed once: training the
-others takes a fraction of the time."""
+"""Compute the outputs of the frozen layers for the mapping images once, which makes training
+faster."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ _MOST = 6e4  # half floats end at 65504
 
 
 class FrozenMaps:
-    """Feature maps of varied copies of pictures, as half floats. Where even one copy of each would
-    be more than `MAX_BYTES`, and where no layer is frozen, nothing is kept: pictures are varied
-    anew whenever they are shown.
+    """Hold feature maps of augmented copies of images, as half floats.
+
+    Nothing is kept if no layer is frozen, or if one copy of each image would exceed `MAX_BYTES`.
+    Images are then augmented at each use.
 
     Args:
-        trunk: the frozen layers; takes normalised images (n, 3, h, w), gives maps (n, c, h', w').
+        trunk: the frozen layers, from normalised images (n, 3, h, w) to maps (n, c, h', w').
         pictures: bytes (n, h, w, 3).
-        rows: the pictures that will be asked for.
+        rows: the images that will be used.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class FrozenMaps:
 
 
 def plain_maps(trunk: nn.Sequential, pictures: Tensor) -> Tensor:
-    """What the frozen layers make of pictures as they are, half floats."""
+    """Return the outputs of the frozen layers for unchanged images, as half floats."""
     trunk.eval()
     with torch.no_grad():
         return torch.cat(

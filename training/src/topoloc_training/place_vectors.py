@@ -1,4 +1,4 @@
-"""What cnn-nn and vlad-nn share: vectors of all mapping images, and their whitening."""
+"""Compute vectors of all mapping images and their whitening, for cnn-nn and vlad-nn."""
 
 from __future__ import annotations
 

@@ -1,12 +1,11 @@
-"""The shared vocabularies of `topoloc/retrieval/vocabularies`, learned over recordings of many
-places.
+"""Learn the shared vocabularies of `topoloc/retrieval/vocabularies` from recordings of many places.
 
     python -m topoloc_training.shared_vocabulary KIND OUT.npz RECORDING ...
 
-What is shipped may be learned of rendered worlds and of recordings under a licence that allows it,
-and of nothing else. Each recording counts alike, however long it is. Words are k-means centres; the
-whitening is learned of whole pictures and of halves of their features, for a map's nodes keep those
-features alone that have a 3-D position.
+A shipped vocabulary may be learned only from rendered worlds and from recordings whose licence
+allows it. Each recording has the same weight, independent of its length. Words are k-means centres.
+The whitening is learned from whole images and from halves of their features, because a map's nodes
+keep only features with a 3-D position.
 """
 
 from __future__ import annotations
@@ -40,7 +39,8 @@ Described = tuple[Features, int, int]
 def learn_vocabulary(
     kind: str, recordings: dict[str, list[Described]], num_words: int, dimension: int
 ) -> SharedVocabulary:
-    """Words and whitening of pictures of several recordings, rounded to what the file keeps."""
+    """Return words and whitening of images of several recordings, rounded to the precision of the
+    file."""
     config = VladConfig(
         num_words=num_words,
         dimension=dimension,

@@ -8,8 +8,8 @@ from torch import nn
 
 
 def rounded_to_half(network: nn.Module) -> nn.Module:
-    """The network with weights as the map file keeps them: what is learnt from it fits what is read
-    back."""
+    """Round a network to the weights that the map file can hold, so that training and the stored
+    map agree."""
     with torch.no_grad():
         for value in network.state_dict().values():
             if value.is_floating_point():

@@ -24,7 +24,7 @@ from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc train` takes."""
+    """Define the arguments of `topoloc train`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file; it gets the coarse localizer, in the place of one of the same name. Or an
@@ -87,8 +87,8 @@ class Command:
     def _trained(
         self, path: Path, target: Path, config: CoarseTrainingConfig
     ) -> tuple[dict[str, Any], CoarseModel]:
-        """What `target` says of its new coarse localizer, and that, learned from the map at
-        `path`."""
+        """Train with the map at `path`. Return the facts of the new coarse localizer in `target`,
+        and the localizer."""
         checkpoint = None if self.checkpoint is None else Path(self.checkpoint)
         with progress_bar() as progress:
             topomap = TopoMetricMap.load(path)
@@ -108,7 +108,7 @@ def _widened(model: CoarseModel) -> str:
 
 
 def warnings_of(model: CoarseModel) -> list[str]:
-    """What the user should know of a training that ended well enough."""
+    """Return warnings about a training that ended without an error."""
     warnings = []
     trained = model.settings.get("trained")
     if isinstance(trained, dict) and "not finite" in trained["stopped_by"]:

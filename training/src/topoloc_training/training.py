@@ -46,11 +46,11 @@ class Training:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is to be trained.
+    """Define the subject of a training.
 
-    `pretrained` are the parameters that begin with weights from elsewhere; all others of `network`
-    begin at random. `draw_weights` say how often each row is shown, `score` judges the network on
-    what is held out.
+    `pretrained` are the parameters that start with given weights. All others of `network` start at
+    random. `draw_weights` is the sampling weight of each row. `score` evaluates the network on
+    held-out images.
     """
 
     network: nn.Module
@@ -65,13 +65,13 @@ class Task:
 def fit(
     task: Task, config: TrainingConfig, progress: Progress, checkpoint: Path | None = None
 ) -> Training:
-    """Train; the network ends with the weights of its best epoch. An existing checkpoint is gone on
-    from.
+    """Train. The network ends with the weights of its best epoch. An existing checkpoint is
+    resumed.
 
-    A loss that is not finite ends the training with the best weights so far.
+    A loss that is not finite ends the training with the best weights of earlier epochs.
 
     Raises:
-        TrainingError: the loss was not finite before any epoch was good, or the checkpoint is of
+        TrainingError: the loss was not finite before the first good epoch, or the checkpoint is of
             another training.
     """
     state = _State(task, config)
@@ -199,7 +199,7 @@ class _State:
 
 
 def _train_epoch(task: Task, config: TrainingConfig, state: _State, progress: Progress) -> str:
-    """One epoch. What went wrong, or nothing."""
+    """Train one epoch. Return a description of a failure, else an empty text."""
     seed = config.seed * 100_003 + state.epoch
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # dropout
@@ -232,7 +232,8 @@ def _train_epoch(task: Task, config: TrainingConfig, state: _State, progress: Pr
 
 @contextmanager
 def deterministic(config: TrainingConfig) -> Iterator[None]:
-    """The same sums in the same order on every run; what the caller had set is put back."""
+    """Make sums deterministic: equal in every run. The caller's settings are restored at the
+    end."""
     deterministic, rng_state = torch.are_deterministic_algorithms_enabled(), torch.get_rng_state()
     try:
         torch.use_deterministic_algorithms(True)

@@ -1,5 +1,5 @@
-"""What a coarse localizer learns from: the mapping images, small, each with its node and its
-distances to all of them."""
+"""Build the training data of a coarse localizer: small mapping images, their nodes, and their
+distances to all nodes."""
 
 from __future__ import annotations
 
@@ -47,8 +47,11 @@ class TrainingSet:
 
 
 def decode_pictures(training_set: TrainingSet) -> tuple[list[RgbImage], ImageShape]:
-    """The mapping pictures in colour, and the size that most of them have. Raises MapError where
-    one is damaged."""
+    """Return the mapping images in colour, and the most frequent size.
+
+    Raises:
+        MapError: an image is damaged.
+    """
     pictures = [decode_stored_image(jpeg) for jpeg in training_set.jpegs]
     shapes = np.array([picture.shape[1::-1] for picture in pictures])
     sizes, counts = np.unique(shapes, axis=0, return_counts=True)

@@ -1,5 +1,4 @@
-"""vlad-nn is taught: its vocabulary, by the triplet loss where that is asked for, and its
-whitening."""
+"""Train vlad-nn: its vocabulary, by the triplet loss if configured, and its whitening."""
 
 from __future__ import annotations
 
@@ -36,8 +35,8 @@ def train(
     config: VladNnConfig,
     progress: Progress,
 ) -> CoarseModel:
-    """Learn the vocabulary if the weights bring none, tune the network if the configuration says
-    so, learn the whitening.
+    """Learn the vocabulary if the weights have none, tune the network if configured, learn the
+    whitening.
 
     Raises:
         MapError: a mapping image is damaged.
@@ -73,8 +72,8 @@ def train(
 def learn_words(
     features: Float32[np.ndarray, "n c"], num_clusters: int, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Centroids (k, c) and assignment weights (k, c, 1, 1) from unit features of the mapping
-    images; fewer words where there are few.
+    """Return centroids (k, c) and assignment weights (k, c, 1, 1) from unit features of the mapping
+    images, with fewer words for few features.
 
     Weights are the unit centroids, scaled so that the second nearest word gets one hundredth of the
     nearest one's share on average.

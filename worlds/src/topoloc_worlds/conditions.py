@@ -11,15 +11,15 @@ from topoloc.errors import TopolocError
 
 @dataclass(frozen=True)
 class Condition:
-    """What changes between two visits of the same place.
+    """Define light and weather of one visit of a place.
 
     Attributes:
         daylight: light of the sky, as a share of a clear noon.
-        sun: whether the sun itself shines, with shadows.
-        lamps: share of the lamps that are lit; which ones is the world's choice, from its seed.
+        sun: whether there is direct sunlight, with shadows.
+        lamps: share of the lamps that are lit. The seed of the world selects them.
         wet: whether the ground outside is wet and reflects.
         rain: falling drops, in drops a picture of 640x400.
-        visibility: metres after which 1/e of the light is left.
+        visibility: distance (metres) at which 1/e of the light is left.
     """
 
     name: str

@@ -1,7 +1,6 @@
-"""The recordings of `topoloc demo` made: the lab by day for the map, and what the map is asked
-about.
+"""Render the recordings of `topoloc demo`: the lab by day for the map, and the queries.
 
-topoloc brings them along (`topoloc/demo/lab`), so that the demo needs no renderer.
+topoloc ships them (`topoloc/demo/lab`), so the demo needs no renderer.
 """
 
 from __future__ import annotations
@@ -80,8 +79,7 @@ RECORDINGS = (
 def render_recordings(
     folder: Path, progress: Callable[[str, int, int], None] = lambda stage, done, total: None
 ) -> None:
-    """Render all of the demo's recordings into `folder`; what was begun before goes on where it
-    stopped.
+    """Render all recordings of the demo into `folder`. An interrupted run is resumed.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.

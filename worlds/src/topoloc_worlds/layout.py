@@ -1,11 +1,9 @@
-"""The files of a rendered recording: where they lie, what is in them, and which of them are there
-already.
+"""Define the files of a rendered recording: paths, contents, and the frames already written.
 
-A stereo recording is laid out as KITTI's (``image_2/ image_3/``, grey ``image_0/ image_1/``; depth
-pictures in ``depth_2/`` or ``depth_0/``), one of a single camera as a plain folder (``images/``;
-with depth ``rgb/ depth/``) with its ``camera.json``. Times, calibration and truth are those of the
-whole recording from the beginning, so that one whose pictures are not all there is refused when it
-is opened.
+A stereo recording has KITTI's layout (``image_2/ image_3/``, grey ``image_0/ image_1/``; depth
+images in ``depth_2/`` or ``depth_0/``). A recording of a single camera is a plain folder
+(``images/``; with depth ``rgb/ depth/``) with its ``camera.json``. Times, calibration and ground
+truth cover the whole recording from the start, so opening an incomplete recording raises an error.
 """
 
 from __future__ import annotations
@@ -36,13 +34,13 @@ _UNKNOWN_DEPTH = 0
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a recording's pictures lie, and how they are stored.
+    """Hold the paths and formats of a recording's images.
 
     Attributes:
-        folder: of the recording.
-        baseline: metres to the right camera; None where there is none.
+        folder: folder of the recording.
+        baseline: metres to the right camera; None without one.
         jpeg: quality of JPEG files, 1 to 100; None for PNG.
-        depth_factor: units a metre of depth pictures; None without them.
+        depth_factor: units a metre of depth images; None without them.
     """
 
     folder: Path
@@ -69,7 +67,8 @@ class Layout:
         return "depth" if self.baseline is None else "depth_0" if self.grey else "depth_2"
 
     def pictures(self, index: int) -> dict[str, Path]:
-        """The files of one frame: "left", and "right" and "depth" where there are such."""
+        """Return the files of one frame: "left", and "right" and "depth" if the recording has
+        them."""
         suffix = "png" if self.jpeg is None else "jpg"
         files = {"left": self.folder / self.left / f"{index:06d}.{suffix}"}
         if self.right is not None:
@@ -123,7 +122,7 @@ def prepare(
 
 
 def missing_frames(layout: Layout, num_frames: int) -> list[int]:
-    """The frames of which a file is not there."""
+    """Return the frames with a missing file."""
     return [
         i
         for i in range(num_frames)
@@ -162,7 +161,7 @@ def _encoded(image: Image | UInt16[np.ndarray, "h w"], jpeg: int | None) -> byte
 def _depth_units(
     depth: Float32[np.ndarray, "h w"], depth_factor: float
 ) -> UInt16[np.ndarray, "h w"]:
-    """Depth as it is stored; what is too far for 16 bits, or sky, is unknown."""
+    """Return depth in its stored format. Depth beyond 16 bits and sky are stored as unknown."""
     units = np.rint(np.nan_to_num(depth.astype(np.float64), nan=0.0, posinf=0.0) * depth_factor)
     return np.where((units > 0) & (units < 65535), units, _UNKNOWN_DEPTH).astype(np.uint16)
 
@@ -191,7 +190,11 @@ def _calib(camera: Camera, baseline: float) -> str:
 
 
 def _is_begun(folder: Path) -> bool:
-    """Whether a recording of ours lies here. Raises TopolocError where something else does."""
+    """Return whether a recording of this package is here.
+
+    Raises:
+        TopolocError: the folder holds something else.
+    """
     if not folder.exists():
         return False
     if not folder.is_dir():
@@ -214,7 +217,7 @@ def _read_settings(path: Path) -> dict[str, object]:
 
 
 def _differences(before: object, now: object, name: str = "") -> list[str]:
-    """What two settings do not share, each as words."""
+    """Describe each difference between two settings."""
     if isinstance(before, dict) and isinstance(now, dict):
         keys = [*before, *(key for key in now if key not in before)]
         below = [
@@ -226,7 +229,7 @@ def _differences(before: object, now: object, name: str = "") -> list[str]:
 
 
 def _remove(folder: Path) -> None:
-    """Remove what a recording consists of, and nothing else."""
+    """Remove the files of a recording, and nothing else."""
     for name in _OURS:
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
@@ -235,6 +238,6 @@ def _remove(folder: Path) -> None:
 
 
 def _remove_parts(folder: Path) -> None:
-    """What a run that was killed had half written."""
+    """Remove partly written files of a killed run."""
     for path in folder.glob(".*.part"):
         path.unlink(missing_ok=True)

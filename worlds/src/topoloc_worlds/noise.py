@@ -1,4 +1,4 @@
-"""Random numbers by name, and smooth noise: what textures are made of."""
+"""Generate random numbers by name, and smooth noise for textures."""
 
 from __future__ import annotations
 

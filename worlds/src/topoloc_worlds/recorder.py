@@ -38,16 +38,17 @@ _FEW_FRAMES = 20
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """What is recorded, and how. The recording is a function of this, the world and the condition.
+    """Define the settings of a recording. The recording depends on this, the world and the
+    condition alone.
 
     Attributes:
-        seed: which place of the world's kind.
-        arrangement: where people left the things that they move.
-        route: where the camera goes; `route.seed` also makes the noise and the drops.
+        seed: the place of the world's kind.
+        arrangement: the places of movable objects.
+        route: the camera's path. `route.seed` also determines the noise and the drops.
         baseline: metres between the left and right camera; None for a single camera.
-        num_renderings: renderings over the time of an exposure; 1 leaves motion blur out.
+        num_renderings: renderings over the time of an exposure; 1 has no motion blur.
         lens_drops: drops on each lens.
-        grey: store grey pictures.
+        grey: store grey images.
         jpeg: quality of JPEG files; None for PNG.
         depth: store the left camera's depth, too.
     """
@@ -83,7 +84,7 @@ class RecordConfig:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What lies in the folder now: its frames, how many of them this run rendered, and metres
+    """Hold facts of the folder: its frames, the number that this run rendered, and metres
     travelled."""
 
     num_frames: int
@@ -100,21 +101,20 @@ def record(
     processes: int | None = None,
     overwrite: bool = False,
 ) -> Recorded:
-    """Render a recording into the folder `out`. One that was interrupted goes on where it stopped.
+    """Render a recording into the folder `out`. An interrupted recording is resumed.
 
-    Frames are written one by one, each file whole or not at all, so that an interruption at any
-    time loses only the frames being rendered.
+    Frames are written one by one, each file atomically, so an interruption loses only the frames in
+    progress.
 
     Args:
-        progress: called with ("light", done, total) while the light of the world is traced, if it
-            has to be, then with ("frames", done, total), last of all if this fails.
-        processes: each renders frames of its own; None chooses. They have no influence on the
-            pictures.
-        overwrite: remove a recording of other settings that lies there.
+        progress: called with ("light", done, total) while the light of the world is traced, if
+            needed, then with ("frames", done, total), also after a failure.
+        processes: number of rendering processes; None chooses. It has no influence on the images.
+        overwrite: remove an existing recording with other settings.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.
-        TopolocError: a route that cannot be, or `out` cannot be written or holds something else.
+        TopolocError: the route is impossible, or `out` cannot be written or holds something else.
     """
     variant = use_best_variant()
     route = plan_route(world.loop, world.camera_height, config.route)
@@ -152,7 +152,7 @@ def record(
 
 @dataclass(frozen=True)
 class _Job:
-    """What a process must know to render any frame."""
+    """Hold the data with which a process can render any frame."""
 
     world: World
     condition: Condition

@@ -1,8 +1,8 @@
-"""Routes: a closed line on the ground becomes the path of a camera in time, with the sway of who
-carries it.
+"""Convert a closed line on the ground to the path of a camera in time, with the sway of a walker or
+a car.
 
-The path is a function of time, so that a motion blur can ask between frames, and smooth: the line's
-corners are rounded by a Gaussian kernel and the sway is band-limited, with the bands and sizes of
+The path is a function of time, because motion blur needs poses between frames. It is smooth: a
+Gaussian kernel rounds the line's corners, and the sway is band-limited, with the bands and sizes of
 human gait and of a car on its springs.
 """
 
@@ -30,24 +30,25 @@ _AXES = ("forward", "left", "up", "roll", "pitch", "yaw")
 
 @dataclass(frozen=True)
 class RouteConfig:
-    """How the closed line of a world is walked or driven.
+    """Define the motion along the closed line of a world.
 
     Attributes:
-        laps: times round; a part of a lap is allowed.
+        laps: rounds of the line; fractions are allowed.
         length: metres along the line instead of `laps`.
-        num_frames: stop after so many frames.
-        spacing: metres between frames on the straight; in bends frames come closer, as everybody
-            slows down there.
-        speed: metres a second on the straight; with `spacing` it gives the frame rate.
+        num_frames: stop after this number of frames.
+        spacing: metres between frames on the straight. Frames come closer in bends, because motion
+            is slower there.
+        speed: metres a second on the straight. With `spacing` it gives the frame rate.
         start: metres along the line from its first corner to the first frame.
         lateral: metres to the left of the line, in the direction of travel.
-        reverse: the other way round.
+        reverse: go round in the opposite direction.
         look: radians that the camera is turned to the left of the direction of travel.
-        motion: whose sway it is.
+        motion: kind of sway.
         wobble: size of the sway, 1 is natural, 0 none.
         shake: size of the faster tremble of a hand-held camera, 1 is natural, 0 none.
         corner_radius: smallest radius of the bends, metres.
-        turn_rate: radians a second that the direction turns at most, about: who turns slows down.
+        turn_rate: approximate largest change of direction, radians a second. Motion slows down in
+            bends.
         seed: another seed is another walk on the same line.
     """
 
@@ -144,11 +145,11 @@ class _Waves:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A camera's path in time; `world_from_cam_at` and `frame_poses` ask it.
+    """Hold a camera's path in time, for `world_from_cam_at` and `frame_poses`.
 
-    `points` are one lap, closed (the last is the first again), `yaw` the direction there, `paced`
-    the metres that would have been made on the straight in the time until there, `travelled` the
-    metres that were.
+    `points` are one lap, closed (the last is the first again), and `yaw` the direction there.
+    `travelled` is the distance (metres) to each point, `paced` the distance that the same time
+    would give at the speed of the straight.
     """
 
     config: RouteConfig

@@ -1,5 +1,5 @@
-"""What a world is made of: meshes with materials, and a sky. Data only; metres, world z up, light
-in arbitrary linear units."""
+"""Define the data of a world: meshes with materials, and a sky. Metres, world z up, light in
+arbitrary linear units."""
 
 from __future__ import annotations
 

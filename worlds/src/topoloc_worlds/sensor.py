@@ -1,7 +1,7 @@
-"""From light to the picture that a camera stores: exposure, clipping, vignetting, noise, sRGB.
+"""Convert light to the image that a camera stores: exposure, clipping, vignetting, noise, sRGB.
 
-The automatic exposure stops where real ones do, at a longest time and a largest gain: dark places
-stay dark, and noisy.
+The automatic exposure has the limits of real ones, a longest time and a largest gain. So images of
+dark places are dark and noisy.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class Exposure:
-    """What the camera has chosen for one picture, or one pair: `time` in seconds."""
+    """Hold the exposure of one image or one pair: `time` in seconds."""
 
     time: float
     gain: float

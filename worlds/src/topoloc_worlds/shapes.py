@@ -19,11 +19,11 @@ Vector = Sequence[Number] | Float64[np.ndarray, "3"]
 def panel(
     corner: Vector, across: Vector, down: Vector, repeat: tuple[Number, Number] = (1.0, 1.0)
 ) -> Mesh:
-    """A parallelogram seen by who looks at it with `across` to the right and `down` downwards;
+    """Build a parallelogram with `across` to the right and `down` downwards for its viewer.
     `corner` is its top left.
 
     Args:
-        repeat: how often the picture is repeated across and down.
+        repeat: repeats of the picture across and down.
     """
     origin, x, y = (np.asarray(v, dtype=np.float64) for v in (corner, across, down))
     vertices = np.stack([origin, origin + y, origin + x + y, origin + x])
@@ -187,5 +187,5 @@ def turned(mesh: Mesh, axis: Vector, angle: Number) -> Mesh:
 
 
 def surfaces_placed(surfaces: Sequence[Surface], at: Vector, yaw: Number = 0.0) -> list[Surface]:
-    """A thing of several surfaces put where it stands, as `placed` does it."""
+    """Place an object of several surfaces, as `placed` does for one."""
     return [replace(surface, mesh=placed(surface.mesh, at, yaw)) for surface in surfaces]

@@ -19,13 +19,13 @@ from topoloc_worlds.weather import Drops, draw_lens_drops, draw_rain, falling_dr
 
 @dataclass(frozen=True, eq=False)
 class Shooting:
-    """What all frames of a recording share.
+    """Hold the common settings of all frames of a recording.
 
     Attributes:
-        renderer: the world as it is under `condition`.
+        renderer: the world under `condition`.
         baseline: metres to the right camera; None without one.
-        num_renderings: over how many moments of the exposure the light is averaged; 1 is a picture
-            without motion blur.
+        num_renderings: moments of the exposure over which the light is averaged; 1 has no motion
+            blur.
         lens_drops: drops on each lens.
         rain: whether the condition's rain falls here.
     """

@@ -41,14 +41,14 @@ _WOBBLE_AND_SHAKE: dict[Sway, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class RouteOptions:
-    """Where the camera goes, along the world's closed line."""
+    """Set the camera's path along the world's closed line."""
 
     laps: Annotated[float, tyro.conf.arg(metavar="N")] = 1.0
-    """Times round; 0.25 is a quarter."""
+    """Rounds of the line; 0.25 is a quarter."""
     num_frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Stop after N frames."""
     start: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
-    """Where on the line the first frame is."""
+    """Metres along the line to the first frame."""
     spacing: Annotated[
         float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: the world's)")
     ] = None
@@ -56,16 +56,16 @@ class RouteOptions:
     lateral: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0
     """Metres to the left of the line, seen in the direction of travel; negative is to the right."""
     reverse: Flag = False
-    """The other way round."""
+    """Go round in the opposite direction."""
     look: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
-    """The camera is turned so far to the left."""
+    """Angle of the camera to the left of the direction of travel."""
     sway: Sway = "natural"
-    """That of who walks or drives; `none` is on rails, `hand` trembles as well."""
+    """Sway of a walker or a car; `none` is on rails, `hand` adds a tremble."""
 
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """What is recorded."""
+    """Set the camera and the format of the images."""
 
     camera: Annotated[
         str | None,
@@ -99,14 +99,13 @@ class PictureOptions:
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc simulate` takes."""
+    """Define the arguments of `topoloc simulate`."""
 
     world: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WORLD")]
     """lab, corridor, hospital or street; `demo` renders the recordings of `topoloc demo` into the
     folder OUT, and takes no setting."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """The recording's folder, which is made. A recording that was interrupted goes on where it
-    stopped."""
+    """The recording's folder, which is made. An interrupted recording is resumed."""
     condition: Annotated[str, tyro.conf.arg(metavar="NAME")] = "day"
     """day (or clear), evening, night, cloudy or rain."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
@@ -123,9 +122,9 @@ class Command:
     ] = None
     """Processes that render; they have no influence on the pictures."""
     overwrite: Flag = False
-    """Remove the recording in OUT if its settings are others."""
+    """Remove the recording in OUT if its settings differ."""
     json: File = None
-    """Write what was recorded to this file (- for standard output)."""
+    """Write facts of the recording to this file (- for standard output)."""
 
     def run(self) -> int:
         return self._record_demo() if self.world == "demo" else self._record()
@@ -238,7 +237,11 @@ class Command:
 
 
 def _camera(pictures: PictureOptions) -> Camera:
-    """What --camera and --size say together. Raises UsageError, CalibrationError."""
+    """Return the camera of --camera and --size.
+
+    Raises:
+        UsageError, CalibrationError: the options are invalid.
+    """
     width, height = _size(pictures.size)
     if pictures.camera is None:
         focal = ZED.fx * width / ZED.width

@@ -121,7 +121,7 @@ def _overcast(
 def _dusk(
     directions: Float64[np.ndarray, "h w 3"], to_sun: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "h w 3"]:
-    """The sun has just set below where it stood: a warm band there, blue overhead."""
+    """Make the sky just after sunset: a warm band above the sun's last position, blue overhead."""
     up = np.maximum(directions[..., 2], 0.0)
     west = to_sun[:2] / np.linalg.norm(to_sun[:2])
     facing = 0.5 + 0.5 * (directions[..., :2] @ west) / np.maximum(

@@ -72,8 +72,8 @@ def draw_rain(
     drops: Drops,
     exposure_time: float,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The light with the drops in it, those that are nearer than what is behind them; near ones are
-    thick and out of focus."""
+    """Add drops to the light if they are nearer than the surface behind them. Near drops are thick
+    and out of focus."""
     rainy = radiance.copy()
     time = min(exposure_time, _LONGEST)
     start = cam_from_left.apply(drops.position)
@@ -122,8 +122,8 @@ def _draw_streak(
     share: float,
     glow: Float32[np.ndarray, "3"],
 ) -> None:
-    """Replace this share of the light along a line by `glow`, with a Gaussian profile across, where
-    nothing nearer is in front."""
+    """Replace this share of the light along a line by `glow`, with a Gaussian profile across,
+    except behind nearer surfaces."""
     height, width = depth.shape
     reach = 3.0 * sigma
     low = np.maximum(np.floor(np.minimum(head, tail) - reach), 0).astype(int)

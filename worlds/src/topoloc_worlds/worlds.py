@@ -17,20 +17,19 @@ from topoloc_worlds.scene import Scene
 
 @dataclass(frozen=True)
 class World:
-    """A place that code builds, and how it is usually recorded. The module that builds it is
-    imported when it is needed.
+    """Describe a place that code builds, with its default recording settings. Its module is
+    imported on use.
 
     Attributes:
         module: has ``build(seed, condition, arrangement)``, ``LOOP`` and ``CAMERA_HEIGHT``.
         outdoor: whether rain falls here.
-        speed: metres a second of who walks or drives.
+        speed: metres a second of the walker or car.
         spacing: metres between frames.
         corner_radius: metres, of the bends.
         baseline: metres between left and right camera.
-        depth_factor: units a metre of depth pictures of 16 bits.
-        view_spacing: metres between the places along the line from which the light of the world is
-            traced.
-        view_offsets: metres to the left of the line, of the same.
+        depth_factor: units a metre of depth images of 16 bits.
+        view_spacing: metres along the line between the positions from which light is traced.
+        view_offsets: metres to the left of the line, of the same positions.
     """
 
     name: str
@@ -47,8 +46,8 @@ class World:
     view_offsets: tuple[float, ...] = (-0.3, 0.3)
 
     def build(self, seed: int, condition: Condition, arrangement: int = 0) -> Scene:
-        """All that can be seen. Another seed is another place of the kind; `arrangement` is where
-        people left what they move."""
+        """Build all visible surfaces. Another seed is another place of the kind. `arrangement`
+        moves the movable objects."""
         return self._module().build(seed, condition, arrangement)
 
     @property
@@ -71,7 +70,7 @@ class World:
         )
 
     def viewpoints(self) -> Float64[np.ndarray, "n 3"]:
-        """Places all over where cameras usually are, for `Renderer`."""
+        """Return positions all over the camera's usual paths, for `Renderer`."""
         still = replace(self.route(), spacing=self.view_spacing, wobble=0.0)
         routes = [
             plan_route(self.loop, self.camera_height, replace(still, lateral=offset))

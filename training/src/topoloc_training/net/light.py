@@ -1,7 +1,7 @@
-"""Light and weather put onto a grey picture: what the same place looks like at another hour.
+"""Simulate light and weather of another time in a grey image.
 
-A picture is (h, w) float32 in [0, 1]. Every change is drawn from the generator that is given, so
-that a seed fixes all.
+An image is (h, w) float32 in [0, 1]. Every change is drawn from the given generator, so a seed
+determines the result.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _rain(picture: Grey, generator: Generator) -> Grey:
 
 
 def _fog(picture: Grey, generator: Generator, thickest: float = 0.85) -> Grey:
-    """Blended with one grey, most where the picture would be far away."""
+    """Blend the image with one grey, most in distant parts."""
     rows = np.linspace(-1, 1, picture.shape[0], dtype=np.float32)[:, None]
     far = np.exp(-(((rows - generator.uniform(-0.5, 0.3)) / generator.uniform(0.4, 1.2)) ** 2))
     veil = np.clip(
@@ -108,7 +108,7 @@ def _fog(picture: Grey, generator: Generator, thickest: float = 0.85) -> Grey:
 
 
 def _wet(picture: Grey, generator: Generator) -> Grey:
-    """Surfaces darken where they are rough: contrast turns at the middle greys."""
+    """Darken rough surfaces: the contrast changes at the middle greys."""
     level, slope = generator.uniform(0.2, 0.7), generator.uniform(3, 8)
     return picture * (0.45 + 0.55 / (1 + np.exp(-slope * (picture - level))))
 

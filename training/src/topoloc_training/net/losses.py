@@ -1,5 +1,5 @@
-"""What the network is asked for: the teacher's descriptors and scores, and points told apart across
-light.
+"""Define the losses of the network: distance to the teacher's descriptors and scores, and contrast
+of points across light.
 
 Descriptors (b, n, c) are of unit length, one row a point.
 """
@@ -60,8 +60,8 @@ def placed(
     target: Float[Tensor, "b 1 h w"],
     inside: Bool[Tensor, "b 1 h w"],
 ) -> Float[Tensor, ""]:
-    """In which pixel of its 8x8 cell a key point lies, as one choice among 64; cells count by their
-    key point's score."""
+    """Return the cross entropy of a key point's pixel among the 64 of its 8x8 cell. Cells are
+    weighted by their key point's score."""
     scores, best = functional.pixel_unshuffle(target, _CELL).max(dim=1)
     weight = (
         scores

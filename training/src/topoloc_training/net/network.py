@@ -1,11 +1,11 @@
-"""The network `topoloc-net`: grey picture to key point scores and 64-number descriptors, made for
-two plain CPU cores.
+"""Define the network `topoloc-net`: from a grey image to key point scores and 64-number
+descriptors, on two CPU cores.
 
-Where the time of such networks goes (ONNX Runtime, one thread): a 3x3 convolution of 8 channels at
-half resolution costs twice what one of 32 channels costs at an eighth, of as many multiplications.
-So half resolution sees one strided convolution alone, the depth lies at 1/8 and 1/16, descriptors
-get their fine detail from one 1x1 at a quarter, and scores are made there, of what half resolution
-saw, and unfolded.
+The run time of such networks (ONNX Runtime, one thread) is mostly in the fine levels. With equal
+multiplications, a 3x3 convolution of 8 channels at half resolution costs twice as much as one of 32
+channels at an eighth. So half resolution has one strided convolution alone, and the depth is at 1/8
+and 1/16. Descriptors get their fine detail from one 1x1 convolution at a quarter. Scores are
+computed there from the output of half resolution, and unfolded.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ class TopolocNet(nn.Module):
         return logits, descriptors, places
 
     def forward(self, image: Float[Tensor, "b 1 h w"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Scores, descriptors, and the level by which places are known again: of all levels it
-        keeps best through the night."""
+        """Return scores, descriptors, and the level used for place recognition, which is the most
+        stable one at night."""
         logits, descriptors, places = self._maps(image)
         return torch.sigmoid(logits), descriptors, places
 

@@ -1,8 +1,8 @@
-"""The same points by day and in other light: pixels of a stereo recording, seen again in single
-pictures of the same rendered place.
+"""Find the same points by day and in other light: pixels of a stereo recording, and of single
+images of the same rendered place.
 
-Depth comes from the day's stereo pair, poses from the truth; what the other picture sees behind
-something nearer is left out.
+Depth comes from the day's stereo pair, poses from ground truth. Points that are occluded in the
+other image are left out.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ def located_pixels(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
 def seen_by(
     points: np.ndarray, other_from_day: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which points the other picture sees, and where. Nearest in its cell wins."""
+    """Return the indices of the points that the other image sees, and their pixels. The nearest
+    point of a cell occludes the others."""
     local = points @ other_from_day[:3, :3].T + other_from_day[:3, 3]
     front = np.flatnonzero(local[:, 2] > 0.3)
     local = local[front]

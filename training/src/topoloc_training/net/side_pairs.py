@@ -37,7 +37,8 @@ class _Shown:
     first: tuple[int, int]
 
     def pixels(self, points_side: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Of points in the side camera's frame, in the band; NaN where one is not seen well."""
+        """Return pixels in the band of points in the side camera's frame, NaN for points that are
+        not visible."""
         pixels = np.full((len(points_side), 2), np.nan)
         front = points_side[:, 2] > 0.05
         pixels[front] = self.view.camera.img_from_cam(points_side[front])

@@ -1,10 +1,10 @@
-"""A wall as a camera shows it that looks along it, and as `topoloc.features.extraction` turns
-that to the front again.
+"""Render a wall as seen by a camera that looks along it, rectified as by
+`topoloc.features.extraction`.
 
-What lies ahead on a wall is seen at a slant: it fills fewer and fewer pixels, so that its picture
-from the front is smeared, most where the camera saw it from farthest. Who comes back sees it from
-the other end, smeared the other way. What is learned of both pictures of one wall, is learned for
-the way back.
+A distant part of the wall is seen at a slant. It fills few pixels, so its rectified image is
+blurred, most in the parts farthest from the camera. A camera in the reverse direction sees the wall
+from its other end, with the blur at the opposite side. Features learned from both images of one
+wall also work in the reverse direction.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _FINER = 3  # the camera's pixels are means of so many samples each way
 def slanted(
     front: Float[np.ndarray, "h w"], is_ahead_right: bool, generator: Generator
 ) -> Float[np.ndarray, "h w"]:
-    """The picture of a wall from the front, as what is left of it that a camera saw which stands to
-    one side and looks along it.
+    """Return the front image of a wall with the detail that a camera beside it, looking along it,
+    can see.
 
-    Every pixel stays where it is; the picture is as sharp as the camera saw it. The tangent of
-    pixel x grows to the right or to the left.
+    Every pixel stays in place, and has the sharpness of the camera's image. The tangent of pixel x
+    grows to the right or to the left.
     """
     height, width = front.shape
     first = generator.uniform(_NEAREST, max(_NEAREST, _FARTHEST - width / _FOCAL_PX))

@@ -1,5 +1,5 @@
-"""Training pictures and what a teacher says of each, computed once and kept in files: the teacher
-sees every picture as it is."""
+"""Compute training images and the teacher's outputs once, and store them in files. The teacher gets
+unchanged images."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ class Lessons:
 
 
 def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
-    """Read the cache, or ask the teacher (an ONNX file of the contract, 64 numbers, stride 4) about
-    every picture of the folders.
+    """Read the cache, or run the teacher (an ONNX file of the contract, 64 numbers, stride 4) on
+    all images of the folders.
 
-    A folder may end with `::step` to take every so manieth picture.
+    A folder may end with `::step` to take every `step`-th image.
     """
     key = {"folders": folders, "teacher": teacher.name, "size": [WIDTH, HEIGHT]}
     index_file = cache / "lessons.json"
@@ -115,7 +115,7 @@ def _opened(
 
 
 def _fitted(picture: UInt8[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "384 640"], float]:
-    """Scaled to the width, rows below cut off or, where there are too few, mirrored."""
+    """Scale an image to the width. Crop rows at the bottom, or mirror them if there are too few."""
     scale = WIDTH / picture.shape[1]
     if scale != 1:
         interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR

@@ -58,8 +58,7 @@ class TrainNet:
     out: Path = Path("net")
     """Folder of the state, of the log and of the network."""
     name: Literal["topoloc-net", "topoloc-net-sides"] = KIND
-    """Which of the two networks that ship it is to be: the one of pictures, or of what they show to
-    the sides."""
+    """The network to train: for images, or for virtual views."""
     steps: int = 8000
     batch: int = 4
     """Samples a step; each gives two views."""
@@ -74,14 +73,13 @@ class TrainNet:
     (`slants.py`)."""
     seed: int = 1
     start: Path | None = None
-    """State of an earlier training to begin with, what it lacks begins at random; or the network's
-    ONNX file, with `--frozen-norms`."""
+    """State of an earlier training to start from; missing weights start at random. With
+    `--frozen-norms` it is the network's ONNX file."""
     frozen_norms: bool = False
-    """Leave the batch norms as they are: in an ONNX file they were folded into what comes before
-    them."""
+    """Keep the batch norms fixed: an ONNX file has them folded into the layers before them."""
     threads: int = 1
     minutes: float = 1e9
-    """Stop after so long; the state is kept."""
+    """Stop after this time (minutes). The state is kept."""
 
 
 def train(config: TrainNet) -> None:
@@ -158,8 +156,8 @@ def train(config: TrainNet) -> None:
 
 
 def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, ...]:
-    """Cosine to the teacher, told apart against the teacher, told apart across light, score, place
-    of key points."""
+    """Return the losses: cosine to the teacher, contrast against the teacher, contrast across
+    light, score, position of key points."""
 
     def both(name: str) -> Tensor:
         """First views of all samples, then second ones."""
@@ -283,7 +281,7 @@ def _side_pairs(pictures: Path, out: str, back: str) -> list[Pair]:
 
 
 def _cut(pair: Pair) -> Pair:
-    """Without what lies below the rows that the teacher saw."""
+    """Remove points below the rows that the teacher saw."""
     kept = (pair.day_px[:, 1] < HEIGHT - 1) & (pair.other_px[:, 1] < HEIGHT - 1)
     return Pair(pair.day, pair.other, pair.day_px[kept], pair.other_px[kept])
 

@@ -1,5 +1,5 @@
-"""What one step of training looks at: two views of the same points in different light, and what the
-teacher says of the points."""
+"""Make the input of one training step: two views of the same points in different light, and the
+teacher's outputs for these points."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ _CLEAN = 0.3  # share of first views in unchanged light
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Two views (2, h, w) in [0, 1], the teacher's scores seen the same way and where they are to
-    be learned. Of a sample that is not taught the teacher says nothing: its points are learned of
-    each other alone.
+    """Hold two views (2, h, w) in [0, 1], the teacher's scores under the same transforms, and the
+    mask of pixels with scores to learn.
 
-    Points (2, n, 2), the teacher's descriptors of them (n, 64), whether a point lies in each view
-    (2, n), and which points are so near each other that they are no rivals (n, n).
+    A sample that is not taught has no teacher outputs: its points are learned from each other
+    alone. Points are (2, n, 2), the teacher's descriptors of them (n, 64). Further arrays mark the
+    points that lie in each view (2, n), and pairs of points that are too near each other to be
+    negatives (n, n).
     """
 
     views: np.ndarray
@@ -110,8 +111,8 @@ def _of_pair(
     generator: Generator,
     is_wall: bool = False,
 ) -> Sample:
-    """Of walls, most of which are bare, points are drawn where the teacher sees key points; of
-    other pairs anywhere."""
+    """Draw points of walls at the teacher's key points, because most of a wall is bare. Draw points
+    of other pairs anywhere."""
     first, second, pair = known[int(generator.integers(len(known)))]
     weights = (
         _told(lessons.scores[first], pair.day_px) + _told(lessons.scores[second], pair.other_px)
@@ -245,8 +246,8 @@ def _nudged(place: Float[np.ndarray, "3 3"], generator: Generator) -> Float[np.n
 
 
 def _chosen_points(score: np.ndarray, generator: Generator) -> Float[np.ndarray, "n 2"]:
-    """Two thirds where the teacher sees key points, the rest anywhere; with fractions of a
-    pixel."""
+    """Draw two thirds of the points at the teacher's key points, the rest anywhere, with fractions
+    of a pixel."""
     inner = score[_EDGE:-_EDGE, _EDGE:-_EDGE]
     weight = inner.ravel().astype(np.float64) + 1e-5
     flat = generator.choice(weight.size, NUM_POINTS * 2 // 3, p=weight / weight.sum())

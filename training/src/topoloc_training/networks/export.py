@@ -1,10 +1,11 @@
-"""Networks of local features to ONNX, all by one contract, so that one extractor serves every kind.
+"""Export networks of local features to ONNX by one contract, so that one extractor serves every
+feature type.
 
 Input `image` (1, 1, h, w) float32, grey in [0, 1], h and w multiples of 32. Outputs `scores` (1, 1,
 h, w) in [0, 1] and `descriptors` (1, c, h/s, w/s), not of unit length: pixel (x, y) lies at ((x +
-0.5) / s - 0.5, (y + 0.5) / s - 0.5) of it, or the two levels that these are the sum of (`lean.py`).
-A network may have a third, `places` (1, c, h/p, w/p), by which places are known again; its class
-then names all three as `outputs`.
+0.5) / s - 0.5, (y + 0.5) / s - 0.5) of it. Instead of descriptors, a network may have the two
+levels whose sum they are (`lean.py`). A network may have a third output, `places` (1, c, h/p, w/p),
+for place recognition. Its class then names all three as `outputs`.
 """
 
 from __future__ import annotations

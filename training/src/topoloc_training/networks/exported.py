@@ -15,10 +15,10 @@ _OUTPUT = "/Conv_output_0"
 
 
 def load_exported(network: nn.Module, path: Path) -> None:
-    """Give a network the weights of the file that it was exported to.
+    """Load the weights of an exported file into its network.
 
-    Batch norms were folded into the convolutions before them, so here they do nothing but add what
-    these had as a bias: they must stay as they are while the network learns on.
+    The export folded batch norms into the convolutions before them. Here they only add the bias of
+    these, and must stay fixed while the network continues to learn.
 
     Raises:
         ValueError: the file holds another network.
@@ -46,7 +46,7 @@ def load_exported(network: nn.Module, path: Path) -> None:
 
 
 def freeze_norms(network: nn.Module) -> None:
-    """Let the batch norms be what they are, also in training."""
+    """Fix the batch norms, also in training."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.eval()

@@ -30,8 +30,8 @@ class ConvNormReLU(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions with batch norm beside the identity, or a 1x1 convolution where the
-    number of channels changes."""
+    """Apply two 3x3 convolutions with batch norm beside the identity, or beside a 1x1 convolution
+    if the number of channels changes."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()

@@ -1,10 +1,10 @@
-"""What a finished network need not do: an exported graph that gives the same in less time.
+"""Rewrite the exported graph of a finished network so that it computes the same in less time.
 
-Two rewritings, both of what is linear. A normalisation after a sum of convolutions becomes a part
-of their weights. And where descriptors are a sum of an enlarged coarse level and a 1x1 convolution
-of a fine one, the two levels are given instead of the sum, pixel after pixel
-(`topoloc.features.learned.TwoLevelDescriptors`): asked for at a thousand key points, the sum costs
-next to nothing; everywhere, a tenth of the network.
+Both rewritings concern linear parts. A normalisation after a sum of convolutions becomes a part of
+their weights. If descriptors are a sum of an enlarged coarse level and a 1x1 convolution of a fine
+one, the graph returns the two levels instead of the sum
+(`topoloc.features.learned.TwoLevelDescriptors`). The sum at a thousand key points costs next to
+nothing. At all pixels it costs a tenth of the network.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from onnx import helper, numpy_helper
 
 
 def made_lean(model: onnx.ModelProto) -> None:
-    """Rewrites a network of the contract of `export.py` in place, where it has such parts."""
+    """Rewrite a network of the contract of `export.py` in place, if it has such parts."""
     _fold_normalization(model.graph)
     _give_levels(model.graph)
     onnx.checker.check_model(model)
@@ -48,8 +48,8 @@ def _fold_normalization(graph: onnx.GraphProto) -> None:
 
 
 def _summed_convolutions(graph: onnx.GraphProto, name: str) -> list[onnx.NodeProto]:
-    """Those, with a bias, that a value is the sum of, enlarged or not; none where it is anything
-    else."""
+    """Return the convolutions with a bias whose sum, enlarged or not, is a value; empty if it is
+    anything else."""
     node = _maker(graph, name)
     if node is not None and node.op_type == "Add":
         parts = [_summed_convolutions(graph, one) for one in node.input]
@@ -112,7 +112,7 @@ def _give_levels(graph: onnx.GraphProto) -> None:
 
 
 def _doubles(graph: onnx.GraphProto, resize: onnx.NodeProto) -> bool:
-    """Does it enlarge to twice the rows and columns, bilinear, with the borders where they are?"""
+    """Return whether it doubles rows and columns, bilinearly, with fixed borders."""
     attributes = {attribute.name: attribute.s.decode() for attribute in resize.attribute}
     mode, coordinates = (
         attributes.get("mode"),

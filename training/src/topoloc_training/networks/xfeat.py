@@ -31,7 +31,7 @@ def _chain(*layers: tuple[int, int, int, int]) -> nn.Sequential:
 
 
 def _bilinear_weights() -> Float[Tensor, "64 1 3 3"]:
-    """What each pixel of a cell takes from its own and the eight cells around, enlarging bilinearly
+    """Return the bilinear weights of the cell and its eight neighbours for each pixel of the cell,
     with centres at half numbers."""
     offset = (torch.arange(STRIDE) + 0.5) / STRIDE - 0.5
     along = torch.stack([(-offset).clamp(min=0), 1 - offset.abs(), offset.clamp(min=0)], dim=1)

@@ -1,5 +1,5 @@
-"""What the corridor's walls and floor are covered with: pictures as long as the wall, so that no
-metre is the copy of another."""
+"""Make the textures of the corridor's walls and floor. They are as long as the wall, so no part
+repeats."""
 
 from __future__ import annotations
 

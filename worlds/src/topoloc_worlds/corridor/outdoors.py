@@ -1,5 +1,5 @@
-"""What is seen through the corridor's windows: a paved courtyard between the wings, lawn, trees and
-a neighbour's house outside."""
+"""Build the view through the corridor's windows: a paved courtyard between the wings, and a lawn,
+trees and a neighbour's house outside."""
 
 from __future__ import annotations
 

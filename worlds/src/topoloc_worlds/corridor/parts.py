@@ -1,5 +1,5 @@
-"""What is built into the corridor: doors, windows, a lift, handrails, radiators, lamps, signs; in
-the wall's frame of corridor_plan."""
+"""Build the fixed parts of the corridor in the wall's frame of corridor_plan: doors, windows, a
+lift, handrails, radiators, lamps, signs."""
 
 from __future__ import annotations
 
@@ -273,8 +273,8 @@ def hung_sign(
 def ceiling_lamp(
     radiance: float, warmth: float, fittings: Fittings, size: tuple[float, float] = (1.2, 0.4)
 ) -> list[Surface]:
-    """A flat lamp under the ceiling around the origin, whose sides shine too; `warmth` in [0, 1] is
-    the colour of its light.
+    """Build a flat lamp under the ceiling around the origin, with shining sides. `warmth` in [0, 1]
+    is the colour of its light.
 
     Args:
         radiance: 1 is full light, 0 is off.

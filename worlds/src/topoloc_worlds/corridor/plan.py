@@ -1,8 +1,8 @@
-"""The corridor's plan: eight walls round a closed loop, what opens in them, and how things are put
-up on a wall.
+"""Define the corridor's plan: eight walls round a closed loop, their openings, and the placement of
+objects on a wall.
 
-Everything on a wall is built in the wall's own frame: x to the right as one stands before it, y
-into the wall, z up; the corridor is where y < 0.
+Everything on a wall is built in the wall's own frame: x to the right for a viewer in front of it, y
+into the wall, z up. The corridor is at y < 0.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ _OTHERS = {
 
 
 def walls_of(seed: int) -> dict[str, Wall]:
-    """The walls by name, with the doors where this seed has them."""
+    """Return the walls by name, with the doors of this seed."""
     return {wall.name: replace(wall, openings=_openings(wall.name, seed)) for wall in _BARE_WALLS}
 
 

@@ -1,5 +1,5 @@
-"""What opens off the corridor: offices behind doors that stand open, and niches for machines; in
-the wall's frame of corridor_plan."""
+"""Build the rooms beside the corridor in the wall's frame of corridor_plan: offices behind open
+doors, and niches for machines."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def niche(
 
 
 def _shell(fittings: Fittings, depth: float = 3.8, width: float = 3.4) -> list[Surface]:
-    """An office behind a door whose centre is x = 0: walls with a window at the back, floor and
+    """Build an office behind a door with centre x = 0: walls with a window at the back, floor and
     ceiling."""
     near, far, half = WALL_THICKNESS, WALL_THICKNESS + depth, width / 2
     sides = [
@@ -136,8 +136,8 @@ def _around(
 
 
 def _office(fittings: Fittings, rng: np.random.Generator, depth: float) -> list[Surface]:
-    """A desk with a screen and a case of books, for a room whose door is at y = 0 and whose window
-    is `depth` away."""
+    """Build a desk with a screen and a bookcase, for a room with its door at y = 0 and its window
+    at `depth`."""
     top = box((0.0, depth - 1.2, 0.7), (1.6, depth - 0.4, 0.735), texels=0.8)
     legs = [
         box((x, y, 0.0), (x + 0.05, y + 0.05, 0.7))

@@ -1,5 +1,5 @@
-"""What stands about in the corridor. Each thing stands on the floor with its back at y = 0 and
-faces -y, as before a wall."""
+"""Build the movable objects of the corridor. Each stands on the floor with its back at y = 0 and
+faces -y, as in front of a wall."""
 
 from __future__ import annotations
 

@@ -204,8 +204,8 @@ def _put_up(seed: int, wall: Wall, fittings: Fittings) -> list[Surface]:
 
 
 def _fixtures(seed: int, walls: dict[str, Wall], fittings: Fittings) -> list[Surface]:
-    """What has its place in every such corridor: notice boards, extinguishers, rails, radiators,
-    benches, signs overhead."""
+    """Build the fixed furniture of a corridor: notice boards, extinguishers, rails, radiators,
+    benches, overhead signs."""
     rng = rng_of(seed, "corridor/fixtures")
     column = interiors.concrete(rng)
     boards = [prints.notice_board(rng, size) for size in ((560, 840), (560, 1000))]
@@ -272,7 +272,8 @@ _SITES = (
 def _movables(
     seed: int, arrangement: int, walls: dict[str, Wall], fittings: Fittings
 ) -> list[Surface]:
-    """Each thing keeps its look; where it stands, and how it is turned, is the arrangement's."""
+    """Place the movable objects. Their looks depend on the seed, their places and headings on the
+    arrangement."""
     rng = rng_of(seed, "corridor/movables")
     cloth = [(0.2, 0.3, 0.5), (0.55, 0.2, 0.18), (0.25, 0.4, 0.3)][int(rng.integers(3))]
     stock = [

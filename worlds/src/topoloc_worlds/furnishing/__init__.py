@@ -1,1 +1,1 @@
-"""What rooms are furnished with: materials, furniture, things printed and shown."""
+"""Build the furnishing of rooms: materials, furniture, prints and screens."""

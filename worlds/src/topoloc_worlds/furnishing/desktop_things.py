@@ -1,5 +1,5 @@
-"""What lies and stands on desks. Each thing stands on z = 0 around the origin of its own frame and
-faces -y; metres."""
+"""Build objects on desks. Each stands on z = 0 around the origin of its own frame and faces -y;
+metres."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def mouse(finishes: Finishes) -> list[Surface]:
 
 
 def mug(rng: np.random.Generator) -> list[Surface]:
-    """A mug with a stripe or a picture, and what is left of the coffee."""
+    """Build a mug with a stripe or a picture, and a rest of coffee."""
     picture = blank((96, 256), vivid(rng) if rng.uniform() < 0.6 else (0.92, 0.91, 0.88))
     if rng.uniform() < 0.5:
         picture[20:76, 60:190] = photograph(rng, (56, 130))
@@ -167,7 +167,7 @@ def book_stack(rng: np.random.Generator, num: int = 4) -> list[Surface]:
 
 
 def desk_lamp(finishes: Finishes, on: bool, turn: float = 0.0) -> list[Surface]:
-    """A jointed lamp whose shade hangs over the desk in front of it, closed below by an opal
+    """Build a jointed lamp. Its shade is above the desk in front of it, closed below by an opal
     cover."""
     arm = [(0, 0, 0.02), (0.0, 0.1, 0.26), (0.0, -0.13, 0.44)]
     foot = cylinder((0, 0), 0.085, 0, 0.022, 20)

@@ -1,7 +1,7 @@
-"""What rooms are made of: materials with faint, true-to-life structure.
+"""Make the materials of rooms, with faint, realistic structure.
 
-Pictures are in sRGB; a colour of 0.91 there is a reflectance of 0.8. Each docstring says what
-length one repeat of the picture is drawn for, where it has a scale.
+Pictures are in sRGB. A colour of 0.91 there is a reflectance of 0.8. If a picture has a scale, its
+docstring gives the length of one repeat.
 """
 
 from __future__ import annotations
@@ -299,7 +299,7 @@ def laminated(picture: Picture) -> Material:
 
 
 def screen(picture: Picture, on: bool = True, radiance: float = 0.08) -> Material:
-    """A computer screen; dark and faintly mirroring where it is off."""
+    """Make a computer screen. It is dark and slightly reflecting if it is off."""
     return (
         Material("light", picture, radiance=radiance)
         if on

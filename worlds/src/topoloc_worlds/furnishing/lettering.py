@@ -80,11 +80,11 @@ def write(
     max_width_px: Number,
     bold: bool = False,
 ) -> float:
-    """Writes one line into the picture, its base line starting at `at` (x, y), smaller where it
-    would be too wide.
+    """Write one line into the picture, with its base line starting at `at` (x, y). The text is
+    scaled down if it is too wide.
 
     Returns:
-        The width written, pixels.
+        The width of the text, pixels.
     """
     font = cv2.FONT_HERSHEY_DUPLEX if bold else cv2.FONT_HERSHEY_SIMPLEX
     scale = height_px / _EM_PX

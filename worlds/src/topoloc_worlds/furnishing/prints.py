@@ -1,7 +1,7 @@
-"""What hangs on walls and in windows with something printed or written on it: sheets, posters,
-boards. Each piece another one.
+"""Make printed and written pieces for walls and windows: sheets, posters, boards. Each piece is
+different.
 
-All take a generator and give an sRGB picture; sizes are (height, width) in pixels.
+All take a generator and return an sRGB picture. Sizes are (height, width) in pixels.
 """
 
 from __future__ import annotations

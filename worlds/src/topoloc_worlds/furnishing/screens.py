@@ -1,4 +1,4 @@
-"""What computer screens show: program code, a desktop with windows, diagrams, a document, a
+"""Make contents of computer screens: program code, a desktop with windows, diagrams, a document, a
 terminal."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""What the hospital is covered with: pictures of one bay that repeat without a seam, so that every
-metre is the copy of the next."""
+"""Make the textures of the hospital: pictures of one bay that repeat without a seam, so every metre
+looks like the next."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _FLOORS: tuple[Color, ...] = ((0.60, 0.62, 0.63), (0.55, 0.59, 0.56), (0.63, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Finishes:
-    """The materials of one hospital. `corners` are the paints of the squares where wings meet, no
-    two alike."""
+    """Hold the materials of one hospital. `corners` are the different paints of the squares between
+    wings."""
 
     panel: Material
     floor: Material

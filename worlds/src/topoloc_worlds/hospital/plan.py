@@ -1,8 +1,8 @@
-"""The hospital's plan: eight walls round a closed loop, cut into bays of a metre; most are
-panelled, two bays together hold a door.
+"""Define the hospital's plan: eight walls round a closed loop, divided into bays of a metre. Most
+bays are panelled, a door takes two bays.
 
-Everything on a wall is built in the wall's own frame, as in the corridor: x to the right as one
-stands before it, y into the wall, z up; the passage is where y < 0.
+Everything on a wall is built in the wall's own frame, as in the corridor: x to the right for a
+viewer in front of it, y into the wall, z up. The passage is at y < 0.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _DOOR_BAYS = 2
 
 @dataclass(frozen=True)
 class PanelledWall:
-    """One side of one wing.
+    """Define one side of one wing.
 
     Attributes:
-        wall: where it is; outer walls reach round the squares at both ends, which have no panels.
+        wall: its place. Outer walls include the squares at both ends, which have no panels.
         first: metres from the wall's left end to its first bay.
-        num_bays: of a metre each.
+        num_bays: number of bays of a metre each.
         doors: the first of the two bays of each door.
     """
 
@@ -83,7 +83,7 @@ _WALLS = (
 
 
 def walls_of(seed: int) -> dict[str, PanelledWall]:
-    """The walls by name, with the doors where this seed has them."""
+    """Return the walls by name, with the doors of this seed."""
     walls = {}
     for wall in _WALLS:
         num_bays = _SHORT if wall.name.startswith(("east", "west")) else _LONG

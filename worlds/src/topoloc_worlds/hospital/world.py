@@ -1,9 +1,8 @@
-"""A world: the corridor of a hospital ward, a loop of 21 x 13 m whose walls are panels of a metre,
-each the copy of the next.
+"""Build the corridor of a hospital ward: a loop of 21 x 13 m with equal wall panels of a metre.
 
-Handrail, skirting, floor, ceiling and lamps repeat with the panels. What tells one metre from
-another is a door with its sign every eight to ten metres, and what hangs and stands in the four
-squares where wings meet.
+Handrail, skirting, floor, ceiling and lamps repeat with the panels. Only two kinds of objects make
+places distinct: a door with its sign every eight to ten metres, and the furniture of the four
+squares between wings.
 """
 
 from __future__ import annotations
@@ -115,7 +114,7 @@ def _front(
 
 
 def _levels(finishes: Finishes) -> list[Surface]:
-    """Floor and ceiling, whose pictures begin where the first bay does."""
+    """Build floor and ceiling. Their textures begin at the first bay."""
     inner_x, inner_y = LENGTH - 2 * WING, WIDTH - 2 * WING
     wings: tuple[tuple[Vector, float, float], ...] = (
         ((WING, 0.0, 0.0), inner_x, WING),
@@ -181,8 +180,8 @@ def _door(rng: np.random.Generator, width: float, finishes: Finishes) -> list[Su
 
 
 def _squares(seed: int, walls: dict[str, PanelledWall], finishes: Finishes) -> list[Surface]:
-    """The outer walls of the four squares where wings meet, painted, each with prints of its own;
-    one has the window."""
+    """Build the painted outer walls of the four squares between wings, each with its own prints.
+    One wall has the window."""
     names = ("south outer", "east outer", "north outer", "west outer")
     surfaces = []
     for number, name in enumerate(names):
@@ -253,8 +252,8 @@ _SITES = (
 def _movables(
     seed: int, arrangement: int, walls: dict[str, PanelledWall], finishes: Finishes
 ) -> list[Surface]:
-    """Each thing keeps its look; in which square it stands, and how it is turned, is the
-    arrangement's."""
+    """Place the movable objects. Their looks depend on the seed, their squares and headings on the
+    arrangement."""
     rng = rng_of(seed, "hospital/movables")
     fittings = finishes.fittings
     stock = [

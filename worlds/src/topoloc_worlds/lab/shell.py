@@ -1,5 +1,5 @@
-"""The lab's room without its furniture: floor, ceiling, walls, the window front and what is seen
-through it, lamps in the ceiling."""
+"""Build the lab's empty room: floor, ceiling, walls, the window front with the view outside,
+ceiling lamps."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def shell(seed: int, finishes: Finishes, lit: frozenset[int]) -> list[Surface]:
 
 
 def sky_above(condition: Condition, seed: int) -> Sky:
-    """The sun, where it shines, and a patch of sky around it; all else that shines in is on the
-    shafts of `light_shafts`."""
+    """Make the sun, if it shines, and a patch of sky around it. All other light from outside is on
+    the surfaces of `light_shafts`."""
     to_sun = _to_sun(seed)
     rows, columns = 64, 128
     polar, azimuth = np.meshgrid(
@@ -68,13 +68,13 @@ def sky_above(condition: Condition, seed: int) -> Sky:
 
 
 def light_shafts(condition: Condition, seed: int) -> list[Surface]:
-    """What shines in through the windows: panes as bright as the outdoors, and outside of the free
-    window a shaft as bright.
+    """Build the daylight from the windows: panes as bright as the outdoors, and a shaft of equal
+    brightness outside of the free window.
 
-    A room lit by the sky through its windows is the noisiest picture there is: of a hundred paths
-    towards the sky three find the window, while every path finds a pane. The free window lets the
-    sun in: the walls of its shaft are parallel to the rays. By day all this is as overexposed as
-    what would be outside; by night it is as dark.
+    A room that only the sky lights through its windows renders with the most noise: three of a
+    hundred light paths find the window, but every path finds a pane. The free window lets the sun
+    in, because the walls of its shaft are parallel to the sun's rays. By day all this is
+    overexposed like the outdoors, by night it is dark.
     """
     to_sun = _to_sun(seed)
     along = to_sun * (3.0 / to_sun[1])
@@ -121,7 +121,7 @@ def _to_sun(seed: int) -> Float64[np.ndarray, "3"]:
 
 
 def _outdoors(condition: Condition) -> Float64[np.ndarray, "3"]:
-    """Mean radiance of what is outside: blue before sunrise, white by day, a town's glow by
+    """Return the mean radiance of the outdoors: blue before sunrise, white by day, a town's glow by
     night."""
     if condition.daylight <= 0.0:
         return np.array([2.5e-4, 2e-4, 1.6e-4])

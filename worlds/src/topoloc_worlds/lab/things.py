@@ -1,4 +1,4 @@
-"""What makes a room a laboratory: instruments, tools, a robot arm. Each stands on z = 0 around its
+"""Build the laboratory equipment: instruments, tools, a robot arm. Each stands on z = 0 around its
 own origin and faces -y; metres."""
 
 from __future__ import annotations

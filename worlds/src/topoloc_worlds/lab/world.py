@@ -109,9 +109,8 @@ def build(seed: int, condition: Condition, arrangement: int = 0) -> Scene:
 
 
 def _lit(seed: int, condition: Condition) -> frozenset[int]:
-    """Which lamps are on. By day some of the ceiling's; in the dark those of the two desks, of the
-    bench and the one on the floor, or as many of these as somebody left on, and the ceiling's only
-    where most lamps are on."""
+    """Select the lit lamps. By day these are some of the ceiling's. In the dark they are lamps of
+    the desks, of the bench and on the floor, and the ceiling's if more than half are lit."""
     rng = rng_of(seed, "lamps")
     ceiling, others = rng.permutation(len(CEILING_LAMPS)), len(CEILING_LAMPS) + rng.permutation(4)
     if condition.daylight >= DARK:
@@ -206,7 +205,7 @@ def _bench(
 
 
 def _table(seed: int, finishes: Finishes, move: np.random.Generator) -> list[Surface]:
-    """The table in the middle, with what is being worked at."""
+    """Build the table in the middle, with the objects of the current work."""
     rng = rng_of(seed, "table")
     top = _DESK_TOP
     parts = desk(finishes, 1.2, 0.56, drawers=0)
@@ -220,7 +219,7 @@ def _table(seed: int, finishes: Finishes, move: np.random.Generator) -> list[Sur
 
 
 def _on_the_floor(seed: int, finishes: Finishes, move: np.random.Generator) -> list[Surface]:
-    """Chairs, cartons, bins, a tripod: what people push about."""
+    """Build movable objects: chairs, cartons, bins, a tripod."""
     rng = rng_of(seed, "floor")
     parts = []
     for (x, y), yaw in (((1.1, 0.86), 0.0), ((2.7, 0.86), 0.0), ((0.72, 3.25), 2.0)):
@@ -281,7 +280,7 @@ def _built_in(seed: int, finishes: Finishes) -> list[Surface]:
 
 
 def _walls(seed: int, finishes: Finishes) -> list[Surface]:
-    """What hangs on the walls; parts of them stay bare."""
+    """Build the objects on the walls. Parts of the walls stay bare."""
     rng = rng_of(seed, "walls")
     parts: list[Surface] = []
     hung = [calendar(rng), poster(rng), photograph(rng, (360, 480)), poster(rng, (512, 720))]

@@ -1,9 +1,9 @@
-"""What rays meet first: the surface's own colour, its own light, how far it is. No noise in any of
-it.
+"""Find the first surface that each ray hits: its colour, its emission, its distance. All are free
+of noise.
 
-A picture is `albedo * light + emission` at every pixel, and what `sheen` mirrors. Albedo and
-emission carry all textures, edges and screens, and cost one ray a sample; the light on the surfaces
-may be traced beforehand, or filtered, without blurring these.
+A picture is `albedo * light + emission` at every pixel, plus the reflection of `sheen`. Albedo and
+emission have all textures, edges and screens, and cost one ray a sample. The light on the surfaces
+can be traced in advance, or filtered, without blurring these.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ clouds in haze."""
 
 @dataclass(frozen=True, eq=False)
 class FirstHits:
-    """One entry a ray. Where a ray goes through glass or a gap between leaves, it is what lies
-    behind, weighted by what gets through."""
+    """Hold one entry a ray. Behind glass or a gap between leaves, the hits are weighted by the
+    transmitted share."""
 
     albedo: Float32[np.ndarray, "n 3"]
     """Share of light sent back to all sides: the colour of matt surfaces, and of what mirrors too
@@ -123,8 +123,8 @@ def open_towards(
 
 
 def forget_recordings() -> None:
-    """To be called before a scene is loaded: it may come to lie where another one was, and be taken
-    for that by its recording."""
+    """Clear cached data before a scene is loaded. A new scene may have the memory address of an old
+    one, and Mitsuba's recorded code would confuse them."""
     _recorded.cache_clear()
 
 

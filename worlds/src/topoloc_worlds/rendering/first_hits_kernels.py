@@ -1,5 +1,5 @@
-"""The loop along a ray, in Mitsuba's own arrays or numbers: the part of `first_hits` that runs once
-a ray where nothing is vectorised."""
+"""Follow a ray with Mitsuba's arrays or with numbers. Without vectorisation this part of
+`first_hits` runs once a ray."""
 
 from __future__ import annotations
 
@@ -90,8 +90,7 @@ def _add_surface(
     sheen_distance: Any,
     roughness: Any,
 ) -> tuple[Any, tuple[Any, ...]]:
-    """What one surface adds to what was found along a ray so far; also the share of light that
-    passes it."""
+    """Return the contribution of one surface to a ray, and the transmitted share of light."""
     import drjit as dr
     import mitsuba as mi
 
@@ -153,8 +152,8 @@ def _answers(si: Any, hit: Any, bsdf: Any, kind: Any, cosine: Any) -> tuple[Any,
 
 
 def let_through(scene: Any, ray: Any) -> Any:
-    """Share of light that comes through along each ray of an array: 0 where something solid is in
-    the way."""
+    """Return the share of light that passes along each ray of an array; 0 behind a solid
+    surface."""
     import drjit as dr
     import mitsuba as mi
 
@@ -177,7 +176,7 @@ def let_through(scene: Any, ray: Any) -> Any:
 
 
 def flat(parts: tuple[Any, ...]) -> list[float]:
-    """All numbers of what `follow` found along one ray."""
+    """Return all numbers that `follow` found along one ray."""
     return [
         float(component)
         for part in parts

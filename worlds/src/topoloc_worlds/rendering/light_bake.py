@@ -17,13 +17,13 @@ _LIFT = 1e-3  # metres off a surface, so that a ray does not meet it again
 
 @dataclass(frozen=True)
 class LightBakeConfig:
-    """How carefully light is traced.
+    """Define the precision of light tracing.
 
     Attributes:
         finest: metres, the smallest cells.
         angle: size of cells over their distance.
-        rays: rays from each viewpoint into all directions; what they meet is where light is traced
-            to.
+        rays: rays from each viewpoint into all directions. Light is traced to the points that they
+            hit.
         paths: light paths to each such point.
         bounces: reflections on the way from a lamp to that point.
     """
@@ -43,12 +43,13 @@ def bake_light(
     config: LightBakeConfig,
     progress: Progress = lambda stage, done, total: None,
 ) -> LightCells:
-    """Trace the light on all that is seen from `viewpoints`; needs a vectorised variant of Mitsuba.
+    """Trace the light on all surfaces visible from `viewpoints`. It needs a vectorised variant of
+    Mitsuba.
 
     Args:
         light_scene: from `light_scene.load_light_scene`.
-        weigh_lights: how often each light is to be asked for what is seen from a viewpoint, by the
-            name of Mitsuba's parameter.
+        weigh_lights: sampling weight of each light for the surfaces visible from a viewpoint, by
+            the name of Mitsuba's parameter.
         progress: called with ("light", done, total).
     """
     import mitsuba as mi
@@ -130,7 +131,7 @@ def _mean(light: Any, paths: int) -> Float32[np.ndarray, "n 3"]:
 
 
 def _from_lights(scene: Any, sampler: Any, si: Any, active: Any) -> tuple[Any, Any]:
-    """What comes straight from lamps, and from the sky."""
+    """Return the direct light of lamps and sky."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,10 +1,10 @@
-"""The light that falls on the surfaces of a world, kept in small cells of space: found once, used
-by every picture.
+"""Store the light on the surfaces of a world in small cells of space. It is traced once and used by
+every picture.
 
-What lamps, sky and walls send to a matt surface is the same from wherever it is seen. So it is
-traced once for each cell that can be seen from where cameras will be (after Ward et al., *A ray
-tracing solution for diffuse interreflection*, 1988), with as many paths as it takes, and pictures
-have no noise of their own. Direct sunlight, whose shadows are sharp, is not in the cells.
+The light on a matt surface is the same from all viewpoints. So it is traced once for each cell
+visible from possible camera positions (after Ward et al., *A ray tracing solution for diffuse
+interreflection*, 1988), with enough paths, and pictures have no noise of their own. The cells
+exclude direct sunlight, because its shadows are sharp.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ class LightGatherer:
         self._sums = _sum_rows(np.concatenate([self._sums, rows]), where.ravel(), len(self._keys))
 
     def cells(self) -> LightCells:
-        """All that was collected, smoothed where it was little; coarser cells are the means of the
-        finer ones."""
+        """Return all collected light, smoothed in cells with few samples. Coarser cells are means
+        of finer ones."""
         keys, table = self._keys, kernels.hash_table(self._keys)
         counts = self._sums[:, 6].astype(np.float32)
         sharp, soft = (
@@ -150,8 +150,7 @@ def _with_coarser(
     light: Float32[np.ndarray, "n 3"],
     counts: Float32[np.ndarray, " n"],
 ) -> tuple[Int64[np.ndarray, " m"], Float32[np.ndarray, "m 3"]]:
-    """With a pyramid above: whoever looks at a spot that no sample met finds the light around
-    it."""
+    """Add a pyramid of coarser cells, which give the light of spots without a sample."""
     all_keys, all_light = [keys], [light]
     sums = np.column_stack([light * counts[:, None], counts]).astype(np.float64)
     for level in range(kernels.COARSEST + 2):

@@ -31,7 +31,7 @@ def _key(level, ix, iy, iz, side):
 
 @njit(cache=True, inline="always")
 def _level(point, frame, distances, finest, angle):
-    """How coarse the cells are there: they grow with the distance to who looks."""
+    """Return the level of the cells at a point. Cells grow with the distance to the viewpoints."""
     row = min(max(int((point[1] - frame[1]) / frame[3]), 0), distances.shape[0] - 1)
     column = min(max(int((point[0] - frame[0]) / frame[3]), 0), distances.shape[1] - 1)
     distance = np.hypot(distances[row, column], point[2] - frame[2])
@@ -84,8 +84,8 @@ def hash_table(keys):
 
 @njit(cache=True, parallel=True)
 def look_up(points, normals, keys, light, table, frame, distances, finest, angle, ambient):
-    """Light at points on surfaces, between the middles of the cells around; from coarser cells
-    where there is none. (n, 3)."""
+    """Interpolate light at points on surfaces between the centres of the neighbouring cells, or of
+    coarser cells if these are empty. (n, 3)."""
     found = np.empty((len(points), 3), np.float32)
     for i in prange(len(points)):
         side = _side(normals[i])

@@ -1,9 +1,9 @@
-"""Which lights are worth asking, from where the camera is.
+"""Choose sampling weights of lights for the position of the camera.
 
-At every bounce a path asks one light whether it shines there, and Mitsuba asks all of them equally
-often unless told otherwise: in a long street by night that is noise and nothing else. So before
-each picture a few hundred points, those that the camera sees and those that these see, find out
-about how much sun, sky and lamps there are.
+At every bounce a path samples one light. By default Mitsuba samples all lights equally often, which
+renders a long street by night as noise. So before each picture the contributions of sun, sky and
+lamps are measured at a few hundred points: the points visible to the camera, and points visible
+from these.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _LIFT = 1e-3  # metres off a surface, so that a ray does not meet it again
 
 
 class LightChoice:
-    """The lights of a scene, and how often each is to be asked.
+    """Hold the lights of a scene, and their sampling weights.
 
     Attributes:
-        lamps: lamps and screens, in pieces; `mitsuba_scene.load_scene` takes them.
+        lamps: lamps and screens, in pieces for `mitsuba_scene.load_scene`.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -41,12 +41,12 @@ class LightChoice:
     def weights(
         self, loaded: Any, origin: Float64[np.ndarray, "3"], seen: FirstHits
     ) -> dict[str, float]:
-        """How often to ask each light, by the name of Mitsuba's parameter, for a camera at `origin`
-        that sees these points.
+        """Return the sampling weight of each light, by the name of Mitsuba's parameter, for a
+        camera at `origin` that sees these points.
 
-        The sun gets a half, a quarter or a sixteenth of all questions: the paths of a pixel are
-        spread so evenly that then exactly as many ask it, and sunlight and its shadows have no
-        noise of their own.
+        The sun gets a half, a quarter or a sixteenth of all samples. The paths of a pixel are
+        spread so evenly that exactly this number samples the sun, so sunlight and its shadows have
+        no noise.
         """
         points, normals, sky = self._survey(loaded, origin, seen)
         weights: dict[str, float] = {}

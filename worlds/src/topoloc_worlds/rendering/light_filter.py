@@ -1,10 +1,10 @@
-"""Noise out of the light that falls on surfaces: averaged along each surface, across no edge and no
-shadow's border.
+"""Filter the noise of the light on surfaces: average along each surface, but not across edges or
+borders of shadows.
 
-An edge-avoiding a-trous wavelet filter (Dammertz et al., HPG 2010) guided by normals and planes,
-with the brightness' own variance as the measure of what is a shadow and what is noise (Schied et
-al., *Spatiotemporal variance-guided filtering*, 2017). The variance comes from two pictures of the
-same view with independent noise.
+An edge-avoiding a-trous wavelet filter (Dammertz et al., HPG 2010) is guided by normals and planes.
+The variance of the brightness separates shadows from noise (Schied et al., *Spatiotemporal
+variance-guided filtering*, 2017). It comes from two pictures of the same view with independent
+noise.
 """
 
 from __future__ import annotations
@@ -33,14 +33,15 @@ State = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"], Float32[
 
 @dataclass(frozen=True)
 class LightFilterConfig:
-    """How light is smoothed.
+    """Define the filter of light.
 
     Attributes:
-        levels: passes; each doubles the reach, which starts at one pixel.
-        mirror_levels: passes where a mirror or a pane shows what lies elsewhere, which normals and
-            planes know nothing of.
-        contrast: brightness that is still noise, in standard deviations of the noise.
-        flatness: how far from a pixel's plane a point may lie, as a share of its distance to the
+        levels: passes. Each doubles the reach, which starts at one pixel.
+        mirror_levels: passes for mirrors and panes, because normals and planes do not describe
+            their reflections.
+        contrast: largest difference of brightness taken as noise, in standard deviations of the
+            noise.
+        flatness: largest distance of a point to a pixel's plane, as a share of its distance to the
             camera.
         firefly: light above this many times the mean around it, and above this many times the other
             picture's, is cut off.
@@ -61,13 +62,13 @@ def filter_light(
     mirror: Bool[np.ndarray, "h w"],
     config: LightFilterConfig,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Light on the surfaces (radiance over albedo) without its noise.
+    """Return the light on the surfaces (radiance over albedo) without its noise.
 
     Args:
-        radiance: two pictures of what the surfaces send back, with independent noise.
-        normal: unit normals, 0 where there is no surface: such pixels stay as they are.
+        radiance: two pictures of the light that surfaces reflect, with independent noise.
+        normal: unit normals. Pixels without a surface have 0 and stay unchanged.
         position: points relative to the camera (metres).
-        mirror: pixels where only the first `mirror_levels` passes apply.
+        mirror: pixels that get the first `mirror_levels` passes alone.
     """
     reflecting = np.maximum(albedo, _DARKEST)
     first, second = (

@@ -9,12 +9,12 @@ import numpy as np
 
 @nb.njit(cache=True, fastmath=True, nogil=True)
 def _add_neighbours(planes, sigma, kernel, y, v, shift, sums):
-    """Add to each pixel's sums in row y what it takes of the pixel of row v that is `shift` to the
-    right.
+    """Add to each pixel's sums in row y the contribution of the pixel of row v that is `shift` to
+    the right.
 
-    planes: light to mirror, as `spread_light` takes them. sums, (w,) each: of the shares, of the
-    shares times weight, of the variance with the square of that, and of red, green and blue with
-    it.
+    planes: light to mirror, as for `spread_light`. sums, (w,) each: of the shares, of the shares
+    times weight, of the variance with the square of that product, and of red, green and blue with
+    the product.
     """
     light, brightness, weight, variance, doubt, normal, position, reach, mirror = planes
     share, total, total_variance, red, green, blue = sums
@@ -69,13 +69,13 @@ def spread_light(
     weight_out,
     variance_out,
 ):
-    """Average every pixel with its eight neighbours `step` pixels away that are on the same plane
-    and about as bright.
+    """Average every pixel with its eight neighbours `step` pixels away, if they are on the same
+    plane and have similar brightness.
 
-    light, normal, position: (3, h, w). All others (h, w): brightness to compare, weight (how much a
-    pixel's light can be trusted), variance (of its light), doubt (variance of the brightness, for
-    the comparison), reach (metres off its plane that still belong to it), mirror (1 where nothing
-    is to be averaged).
+    light, normal, position: (3, h, w). All others (h, w): brightness to compare, weight (confidence
+    in a pixel's light), variance (of its light), doubt (variance of the brightness, for the
+    comparison), reach (metres off its plane that still belong to it), mirror (1 for pixels that
+    stay unchanged).
     """
     height, width = weight.shape
     planes = (light, brightness, weight, variance, doubt, normal, position, reach, mirror)

@@ -1,6 +1,6 @@
-"""A world as Mitsuba wants it: one mesh a material, lamps, sky and sun.
+"""Convert a world to a Mitsuba scene: one mesh a material, lamps, sky and sun.
 
-Mitsuba is imported where it is used: the data of a world need no renderer.
+Mitsuba is imported inside functions, because the data of a world need no renderer.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _SMOOTHEST = 0.02  # below it a rough surface is as good as a mirror, and slower
 
 
 def load_scene(scene: Scene, lamps: list[tuple[Material, Mesh]]) -> Any:
-    """The scene with its surfaces and lights, without camera and integrator, in Mitsuba's current
-    variant.
+    """Return the scene with its surfaces and lights, without camera and integrator, in Mitsuba's
+    current variant.
 
     Args:
-        lamps: what gives light, in pieces as from `lamp_pieces`; `lamp_name` says what Mitsuba
-            calls each.
+        lamps: light-emitting meshes, in pieces as from `lamp_pieces`. `lamp_name` gives Mitsuba's
+            name of each.
     """
     import mitsuba as mi
 
@@ -59,15 +59,15 @@ def meshes_by_material(scene: Scene) -> list[tuple[Material, Mesh]]:
 
 
 def lamp_pieces(scene: Scene) -> list[tuple[Material, Mesh]]:
-    """All lamps, cut up into pieces of a few metres: one mesh for all lamps of a street would be
-    asked for its light as one."""
+    """Return all lamps, divided into pieces of a few metres. Otherwise all lamps of a street would
+    be one mesh with one sampling weight."""
     lamps = [entry for entry in meshes_by_material(scene) if _shines(entry[0])]
     return [(material, piece) for material, mesh in lamps for piece in pieces(mesh, _LAMP_PIECE)]
 
 
 def pieces(mesh: Mesh, size: float) -> list[Mesh]:
-    """The mesh cut up by a grid of cells of `size` metres in which the middles of its faces lie; no
-    face is cut."""
+    """Divide a mesh by a grid of cells of `size` metres. Each face goes to the cell of its centre,
+    uncut."""
     cells = np.floor(mesh.vertices[mesh.faces].mean(axis=1) / size).astype(np.int64)
     _, group = np.unique(cells, axis=0, return_inverse=True)
     parts = []
@@ -86,7 +86,7 @@ def radiance_of(material: Material) -> Float32[np.ndarray, "*shape 3"]:
 
 
 def lamp_name(index: int) -> str:
-    """What Mitsuba calls the mesh of one of `lamp_pieces`."""
+    """Return Mitsuba's name of the mesh of one of `lamp_pieces`."""
     return f"mesh{index:05d}"
 
 

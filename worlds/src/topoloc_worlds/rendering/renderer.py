@@ -1,4 +1,4 @@
-"""From a world and a camera's pose to what the camera sees: linear light, and exact depth."""
+"""Render a world from a camera's pose: linear light, and exact depth."""
 
 from __future__ import annotations
 
@@ -27,15 +27,14 @@ from topoloc_worlds.scene import Scene
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """How much work goes into a picture.
+    """Define the work spent on a picture.
 
     Attributes:
         albedo_samples: rays a pixel for colours, edges, screens, sky, sunlight and reflections.
-        samples: light paths a pixel where light is not known beforehand; half of them go into each
-            of two pictures, from whose difference the noise is known.
-        bounces: how often light is reflected on its way from a lamp to the camera, in such
-            pictures.
-        bake: how the light of a world is traced beforehand.
+        samples: light paths a pixel if light is not traced in advance. Each of two pictures gets
+            half of them, and their difference gives the noise.
+        bounces: reflections of light between a lamp and the camera, in such pictures.
+        bake: precision of tracing the light of a world in advance.
     """
 
     albedo_samples: int = 4
@@ -57,7 +56,7 @@ class RenderConfig:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What one camera sees."""
+    """Hold the image and the depth of one camera."""
 
     radiance: Float32[np.ndarray, "h w 3"]
     """Linear light: red, green, blue."""
@@ -67,13 +66,13 @@ class Rendering:
 
 
 class Renderer:
-    """A world loaded once, for many pictures.
+    """Render many pictures of a world that is loaded once.
 
-    The same seed gives the same bytes, in every process with the same variant of Mitsuba. With
-    `viewpoints` (n, 3), places all over where cameras will be, the light on all that is seen from
-    there is traced beforehand, or taken from the cache; pictures are then quick and without noise.
-    Without them, and without LLVM, each picture traces its own few light paths and filters their
-    noise.
+    The same seed gives the same bytes, in every process with the same variant of Mitsuba.
+    `viewpoints` (n, 3) are positions all over the camera's paths. With them, the light on all
+    visible surfaces is traced in advance, or read from the cache. Pictures then render fast and
+    without noise. Without them, and without LLVM, each picture traces a few light paths and filters
+    their noise.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.
@@ -103,10 +102,10 @@ class Renderer:
             )
 
     def render(self, camera: Camera, world_from_cam: Rigid3, seed: int) -> Rendering:
-        """What `camera` sees from a pose.
+        """Render the view of `camera` from a pose.
 
         Raises:
-            CalibrationError: a camera with distortion, or whose pixels are not square.
+            CalibrationError: a camera with distortion, or with pixels that are not square.
         """
         if camera.is_distorted or abs(camera.fx / camera.fy - 1.0) > 1e-6:
             raise CalibrationError(
@@ -137,7 +136,7 @@ class Renderer:
         return cached_light(scene, viewpoints, bake, grid, trace)
 
     def _weights_around(self, origin: Float64[np.ndarray, "3"]) -> dict[str, float]:
-        """How often to ask each light for what is seen from a place, whatever the direction."""
+        """Return the sampling weight of each light for all directions from a position."""
         directions = np.random.default_rng(0).standard_normal((_NUM_AROUND, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         return self._lights.weights(
@@ -145,7 +144,7 @@ class Renderer:
         )
 
     def _weigh_lights(self, origin: Float64[np.ndarray, "3"], seen: FirstHits) -> None:
-        """Let paths ask the lights that matter for what is seen from there."""
+        """Set the sampling weights of lights for the visible points."""
         for name, weight in self._lights.weights(self._scene, origin, seen).items():
             self._parameters[name] = weight
         self._parameters.update()
@@ -234,7 +233,7 @@ class Renderer:
     def _trace(
         self, camera: Camera, world_from_cam: Rigid3, seed: int
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]:
-        """What surfaces send back, twice, with independent noise."""
+        """Return the light that surfaces reflect, in two pictures with independent noise."""
         import mitsuba as mi
 
         half = _whole_grid(self._config.samples // 2)
@@ -269,8 +268,8 @@ def _directions_cam(camera: Camera, offset_px: tuple[float, float]) -> Float64[n
 
 
 def _offsets(num: int) -> list[tuple[float, float]]:
-    """Where in a pixel its rays go. The golden ratio's lattice: for any number both coordinates
-    fill their range evenly."""
+    """Return the positions of a pixel's rays in the pixel, on the golden ratio's lattice. For any
+    number, both coordinates are evenly spread."""
     return [((k + 0.5) / num - 0.5, (0.5 + k * _GOLDEN) % 1.0 - 0.5) for k in range(num)]
 
 

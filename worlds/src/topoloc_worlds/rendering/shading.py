@@ -1,5 +1,5 @@
-"""What a ray sees where the light on all surfaces is known: colours, light, direct sun, and one
-reflection."""
+"""Compute the radiance of rays if the light on all surfaces is known: colours, light, direct sun,
+and one reflection."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SAME_NORMAL, _SAME_PLANE = 0.99, 2e-3
 
 @dataclass(frozen=True, eq=False)
 class SurfaceLight:
-    """What falls on the surfaces that the middles of the pixels show."""
+    """Hold the light on the surfaces at the centres of the pixels."""
 
     hits: FirstHits
     light: Float32[np.ndarray, "n 3"]
@@ -33,7 +33,7 @@ class SurfaceLight:
 
 
 class Shader:
-    """A world whose light is known."""
+    """Shade a world with known light."""
 
     def __init__(self, loaded: Any, cells: LightCells, sky: Sky | None) -> None:
         self._loaded, self._cells = loaded, cells
@@ -62,12 +62,12 @@ class Shader:
         middle: SurfaceLight,
         rng: np.random.Generator,
     ) -> Float32[np.ndarray, "n 3"]:
-        """Radiance along rays from `origin`, one a pixel, whose first hits are known.
+        """Return radiance along rays from `origin`, one a pixel, with known first hits.
 
         Args:
-            middle: of the same pixels: where a ray meets the surface that the pixel's middle shows,
-                so does the light.
-            rng: spreads what rough mirrors show.
+            middle: light at the centres of the same pixels. A ray that hits the same surface has
+                the same light.
+            rng: spreads the reflections of rough mirrors.
         """
         elsewhere = _on_other_surface(hits, middle.hits)
         points = origin + hits.position.astype(np.float64)
@@ -92,8 +92,8 @@ class Shader:
         shiny: Int64[np.ndarray, " m"],
         rng: np.random.Generator,
     ) -> Float32[np.ndarray, "m 3"]:
-        """What the mirrors show. Mirrors seen in mirrors are dim: these send back what light falls
-        on them."""
+        """Return the reflections of mirrors. Mirrors seen in mirrors are dim: they reflect only
+        their own light."""
         normals = hits.sheen_normal[shiny].astype(np.float64)
         points = origin + towards * hits.sheen_distance[shiny, None] + _LIFT * normals
         away = towards - 2.0 * np.einsum("ni,ni->n", towards, normals)[:, None] * normals
@@ -124,7 +124,7 @@ class Shader:
         normals: Float32[np.ndarray, "n 3"],
         wanted: Bool[np.ndarray, " n"],
     ) -> Float32[np.ndarray, " m"]:
-        """Share of the sun at the wanted points, 0 where the surface is turned away."""
+        """Return the visible share of the sun at selected points, 0 on surfaces turned away."""
         sun = np.zeros(len(points), np.float32)
         if self._sun_direction is not None:
             lit = np.flatnonzero(wanted & (normals @ self._sun_direction.astype(np.float32) > 0.0))
@@ -136,7 +136,7 @@ class Shader:
 
 
 def _on_other_surface(hits: FirstHits, middle: FirstHits) -> Bool[np.ndarray, " n"]:
-    """Where a ray does not meet the plane that the middle of its pixel shows."""
+    """Return whether a ray misses the plane of the surface at its pixel's centre."""
     turned = np.einsum("ni,ni->n", hits.normal, middle.normal) < _SAME_NORMAL
     off = np.abs(np.einsum("ni,ni->n", hits.position - middle.position, middle.normal))
     return turned | (off > _SAME_PLANE * np.abs(middle.position).max(axis=1))

@@ -1,9 +1,9 @@
-"""Which build of Mitsuba renders: vectorised by LLVM where a usable libLLVM is found, else one ray
-at a time.
+"""Choose the variant of Mitsuba: vectorised by LLVM if a usable libLLVM is found, else one ray at a
+time.
 
-Mitsuba compiles its kernels with whatever libLLVM it finds, and one that does not suit it (LLVM 15,
-for one) aborts the whole process in code generation. So every library is tried out in a child
-process first, and the verdict is remembered.
+Mitsuba compiles its kernels with any libLLVM that it finds. An unsuitable one (LLVM 15, for
+example) aborts the whole process in code generation. So every library is first tested in a child
+process, and the result is stored.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ def use_best_variant(force: str | None = None) -> str:
     """Make Mitsuba's fastest usable variant current, and return its name.
 
     Args:
-        force: a variant's name to use whatever is found; the environment variable
+        force: a variant's name, used without tests. The environment variable
             TOPOLOC_MITSUBA_VARIANT does the same.
 
     Raises:
         MissingExtraError: Mitsuba is not installed.
-        TopolocError: the variant asked for is unknown, or needs a libLLVM and none works.
+        TopolocError: the forced variant is unknown, or needs a libLLVM and none works.
     """
     _keep_kernels()
     try:
@@ -122,8 +122,8 @@ def installed_llvms() -> list[str]:
 
 
 def _renders(library: str) -> bool:
-    """Whether Mitsuba can render with this library, tried in a process of its own, whose last words
-    nobody needs to hear."""
+    """Return whether Mitsuba can render with this library, tested in a process of its own. Its
+    error output is dropped."""
     environment = {**os.environ, _LIBRARY: library}
     try:
         child = subprocess.run(
@@ -147,8 +147,11 @@ def _key(library: str) -> str | None:
 
 
 def cache_folder() -> Path:
-    """Where things are kept that can be made again. Raises RuntimeError where the user has no
-    home."""
+    """Return the folder for files that can be made again.
+
+    Raises:
+        RuntimeError: the user has no home folder.
+    """
     folder = os.environ.get("XDG_CACHE_HOME")
     return Path(folder or Path.home() / ".cache") / "topoloc"
 

@@ -38,8 +38,8 @@ def upright(spans: Openings, y: float) -> Float64[np.ndarray, "n 4 3"]:
 
 
 def wall_uv(corners: Float64[np.ndarray, "n 4 3"], shift: float) -> Float64[np.ndarray, "n 4 2"]:
-    """Where a picture of a wall of WALL_METRES lies on a front: its foot at z = 0, moved sideways
-    by `shift` metres."""
+    """Map a picture of a wall of WALL_METRES to a front: its foot at z = 0, moved sideways by
+    `shift` metres."""
     height, width = WALL_METRES
     return np.stack(
         [
@@ -58,8 +58,8 @@ def wall(
     blind: Bool[np.ndarray, "r c"],
     shift: float,
 ) -> tuple[Mesh, Openings]:
-    """A wall from z[0] to z[1] with openings where columns and rows cross, except the blind ones;
-    and these openings."""
+    """Build a wall from z[0] to z[1] with an opening at each crossing of a column and a row, except
+    blind ones. Return the openings, too."""
     xs = np.unique([0.0, width, *(x for column in columns for x in column)])
     zs = np.unique([*z, *(height for row in rows for height in row)])
     holes = np.array(

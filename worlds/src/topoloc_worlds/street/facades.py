@@ -78,7 +78,7 @@ def house(
     rng: np.random.Generator,
     kit: StreetMaterials,
 ) -> list[Surface]:
-    """One house; `sides` says which of its other walls there are ("l", "r", "b")."""
+    """Build one house. `sides` lists its other walls ("l", "r", "b")."""
     choices: tuple[Material, ...] = getattr(kit, style.wall)
     material, trim = choices[int(rng.integers(0, len(choices)))], kit.trims[style.trim]
     shift = float(rng.uniform(0.0, 14.0))

@@ -1,5 +1,5 @@
-"""What closes a street to both sides: rows of houses, gaps with gardens, yards and walls, and the
-town behind them."""
+"""Build both sides of a street: rows of houses, gaps with gardens, yards and walls, and the town
+behind them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FOOT = 0.13
 
 
 def fronts(seed: int, kit: StreetMaterials, things: FurnitureMaterials) -> list[Surface]:
-    """All houses on both sides of the circuit, and what is between and behind them."""
+    """Build all houses on both sides of the circuit, and the objects between and behind them."""
     rows = [
         ((_OUT[0], -_OUT[1]), np.pi, 2 * _OUT[0]),
         ((-_OUT[0], -_OUT[1]), np.pi / 2, 2 * _OUT[1]),

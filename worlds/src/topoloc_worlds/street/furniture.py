@@ -1,5 +1,5 @@
-"""What stands on pavements: lamps, traffic signs and lights, bins, post boxes, advertising pillars,
-bus stops, benches, bollards."""
+"""Build objects on pavements: lamps, traffic signs and lights, bins, post boxes, advertising
+pillars, bus stops, benches, bollards."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ def bus_stop(
 def bin_of(
     rng: np.random.Generator, kit: StreetMaterials, things: FurnitureMaterials
 ) -> list[Surface]:
-    """A dustbin on wheels, put out by whoever lives there."""
+    """Build a dustbin on wheels in front of a house."""
     body = [things.green, things.blue, kit.iron, things.yellow][int(rng.integers(0, 4))]
     tub = join(
         [box((-0.28, -0.3, 0.08), (0.28, 0.3, 0.95)), box((-0.31, -0.34, 0.95), (0.31, 0.36, 1.05))]

@@ -1,5 +1,5 @@
-"""The materials of a street, made once and shared: walls, trims, roofs, panes, boards; lit ones
-where lamps are on."""
+"""Make the materials of a street, once for all uses: walls, trims, roofs, panes, boards, and lit
+ones."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _DAYLIT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class StreetMaterials:
-    """One object each, so that a renderer can join what is of the same material.
+    """Hold one object a material, so that a renderer can join all surfaces of the same material.
 
-    A pair of materials is (unlit, lit); `lit` is the share of windows and boards with light, 0 by
+    A pair of materials is (unlit, lit). `lit` is the share of windows and boards with light, 0 by
     day.
     """
 
@@ -64,8 +64,7 @@ class StreetMaterials:
 
 
 def street_materials(seed: int, condition: Condition) -> StreetMaterials:
-    """All materials of one town. By day they do not depend on the condition, only what is lit
-    does."""
+    """Make all materials of one town. By day only the lit ones depend on the condition."""
     rng = rng_of(seed, "street/materials")
     plasters = [
         Material("matt", plaster(rng, _PLASTERS[i])) for i in rng.permutation(len(_PLASTERS))[:6]

@@ -119,7 +119,7 @@ def crossings(seed: int) -> list[int]:
 
 
 def roads(seed: int, wet: bool) -> list[Surface]:
-    """Asphalt, kerbs and pavements of the whole circuit, and puddles where it is wet."""
+    """Build asphalt, kerbs and pavements of the whole circuit, and puddles on wet ground."""
     rng = rng_of(seed, "roads")
     pictures = [_asphalt(rng, "plain") for _ in range(_NUM_PLAIN)] + [
         _asphalt(rng, "crossing"),
@@ -149,7 +149,7 @@ def roads(seed: int, wet: bool) -> list[Surface]:
 
 
 def ground(picture: Picture, wet: bool) -> Material:
-    """What one walks and drives on: matt when dry; water makes it darker and gives it a gloss."""
+    """Make the surface of roads and pavements: matt if dry. Water makes it darker and glossy."""
     if not wet:
         return Material("matt", picture)
     return Material("polished", (picture * 0.72).astype(np.uint8), roughness=0.14)
@@ -272,7 +272,7 @@ def _repairs(rng: np.random.Generator, value: np.ndarray) -> None:
 
 
 def _markings(kind: str) -> np.ndarray:
-    """Where there is white paint: 1, as (h, w, 1)."""
+    """Return a mask of white paint, as (h, w, 1)."""
     h, w = _TILE_PX
     paint = np.zeros((h, w), np.float32)
 

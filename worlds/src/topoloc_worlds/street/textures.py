@@ -1,5 +1,5 @@
-"""Pictures of what streets are built of: plaster, brick, stone, concrete, roof tiles, slabs, bark,
-leaves, earth."""
+"""Make the textures of streets: plaster, brick, stone, concrete, roof tiles, slabs, bark, leaves,
+earth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def colored(color: Color, value: Field) -> Picture:
 
 
 def weathering(rng: np.random.Generator, size: tuple[int, int]) -> Field:
-    """What years do to a wall, as a factor: blotches, streaks of rain from above, damp at the
+    """Return the ageing of a wall as a factor: blotches, streaks of rain from above, damp at the
     foot."""
     h, w = size
     streaks = cv2.GaussianBlur(
@@ -57,8 +57,7 @@ def weathering(rng: np.random.Generator, size: tuple[int, int]) -> Field:
 
 
 def plaster(rng: np.random.Generator, color: Color) -> Picture:
-    """A plastered wall with a few cracks, mended places and, now and then, where plaster came
-    off."""
+    """Make a plastered wall with a few cracks, mended places and some gaps in the plaster."""
     size = WALL_SIZE
     value = weathering(rng, size) + 0.018 * smooth_noise(rng, size, 0.8)
     for _ in range(rng.integers(2, 6)):
@@ -114,7 +113,7 @@ def brickwork(rng: np.random.Generator, color: Color, joint: Color) -> Picture:
 
 
 def ashlar(rng: np.random.Generator, color: Color, course: int = 24, length: int = 48) -> Picture:
-    """Blocks of stone, or panels of concrete where they are large."""
+    """Make blocks of stone, or panels of concrete if they are large."""
     h, w = WALL_SIZE
     value = weathering(rng, (h, w)) + 0.025 * smooth_noise(rng, (h, w), 1.0)
     for row, y in enumerate(range(0, h, course)):

@@ -1,5 +1,5 @@
-"""What is behind the panes of a town: rooms with curtains and blinds, display windows of shops, and
-the boards above them."""
+"""Build the scenes behind panes: rooms with curtains and blinds, display windows of shops, and the
+boards above them."""
 
 from __future__ import annotations
 

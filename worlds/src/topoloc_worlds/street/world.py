@@ -66,12 +66,12 @@ LOOP = _driven_line()
 
 
 def build(seed: int, condition: Condition, arrangement: int = 0) -> Scene:
-    """The street.
+    """Build the street.
 
     Args:
-        seed: which town.
-        condition: light and weather; nothing stands elsewhere because of them.
-        arrangement: where cars are parked and bins put out.
+        seed: seed of the town.
+        condition: light and weather. It moves no object.
+        arrangement: seed of the positions of parked cars and bins.
     """
     kit = street_materials(seed, condition)
     things = furniture_materials(rng_of(seed, "street/furniture"))
@@ -104,8 +104,8 @@ def _beside(
 
 @dataclass(frozen=True)
 class _KeptFree:
-    """Where no car may stand: stations of zebra crossings, from and to; stations and sides (+1 is
-    right) of bus stops."""
+    """Return the places without parked cars: stations of zebra crossings, from and to; stations and
+    sides (+1 is right) of bus stops."""
 
     zebras: tuple[tuple[float, float], ...]
     bus_stops: tuple[tuple[float, float], ...]
