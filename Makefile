@@ -4,6 +4,7 @@
 # make test-slow   the few tests that `make test` leaves out for their time: the paper made again, networks trained
 # make acceptance   the commands as a user types them, on the recordings in ../shared; compares figures with benchmarks/acceptance.json
 # make acceptance-quick   the part of it that takes at most three minutes
+# make judge     the tables by which a change of answers is judged, beside benchmarks/judged; 60 minutes on two idle cores, goes on where it stopped
 # make lint      the same without the tests; warns of figures above their budgets (tools/budgets.py)
 # make docs      these pages as HTML, in docs/_build/html; a warning is an error
 # make release REPOSITORY=https://github.com/OWNER/topoloc   the four distributions, in dist/, with the addresses for an index
@@ -18,7 +19,7 @@ CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
 # Without a look at the network for a newer pyright; its node comes from the package index.
 PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 
-.PHONY: demo install test test-slow acceptance acceptance-quick lint kernels docs release clean
+.PHONY: demo install test test-slow acceptance acceptance-quick judge lint kernels docs release clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-core
@@ -45,6 +46,9 @@ acceptance: kernels
 
 acceptance-quick: kernels
 	@$(BIN)/python benchmarks/acceptance.py --quick
+
+judge: kernels
+	@$(BIN)/python benchmarks/judge.py
 
 lint: $(VENV)/installed-test
 	@$(BIN)/ruff check --quiet

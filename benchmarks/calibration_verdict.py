@@ -7,7 +7,9 @@ python benchmarks/calibration_verdict.py kitchen.topo kitchen@60-99/100 --every 
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 from topoloc.geometry.calibration_check import CalibrationConsistency, check_calibration_consistency
@@ -77,6 +79,7 @@ def main() -> None:
     parser.add_argument("map")
     parser.add_argument("recording", help="of one camera, rightly calibrated")
     parser.add_argument("--every", type=int, default=1, help="ask every Nth frame")
+    parser.add_argument("--json", type=Path, help="write the counts to this file")
     args = parser.parse_args()
     localizer, sequence = Localizer(TopoMetricMap.load(args.map)), open_sequence(args.recording)
     counts = {(num, is_right): [0, 0] for num in NUM_PICTURES for is_right in (True, False)}
@@ -97,6 +100,13 @@ def main() -> None:
             f"{num:3d} pictures: {named} of {of_wrong} wrong calibrations named, {accused} of {of}"
             " right ones accused"
         )
+    if args.json:
+        columns = ("accused", "right", "named", "wrong")
+        rows = {
+            num: dict(zip(columns, (*counts[num, True], *counts[num, False]), strict=True))
+            for num in NUM_PICTURES
+        }
+        args.json.write_text(json.dumps(rows, indent=1))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python benchmarks/floors.py ask MAP RECORDING [RECORDING ...] --out FILE [--other] [--every N]
     python benchmarks/floors.py fit FILE [FILE ...]
-    python benchmarks/floors.py judge FILE [FILE ...]
+    python benchmarks/floors.py judge FILE [FILE ...] [--json FILE]
 
 Recordings by `topoloc simulate corridor --seed N` of other seeds are other floors (`--other`).
 `ask` appends a line for each image: the pose's probability without the appearance, the agreement of
@@ -37,6 +37,10 @@ from topoloc.localization.result import Localization
 from topoloc.recordings.open import open_sequence
 
 Row = dict[str, Any]
+COLUMNS = (
+    *("images", "before", "now", "with the setting"),
+    *("streams", "streams before", "streams now", "streams with the setting"),
+)
 
 
 def main() -> None:
@@ -48,6 +52,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--other", action="store_true")
     parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--json", type=Path, help="write the counts of `judge` to this file")
     arguments = parser.parse_args()
     if arguments.step == "ask":
         ask(arguments.paths[0], arguments.paths[1:], arguments)
@@ -57,7 +62,12 @@ def main() -> None:
         for path in arguments.paths
         for line in Path(path).read_text(encoding="utf-8").splitlines()
     ]
-    fit(rows) if arguments.step == "fit" else judge(rows)
+    if arguments.step == "fit":
+        fit(rows)
+        return
+    counts = judge(rows)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(counts, indent=1))
 
 
 def ask(map_file: str, recordings: list[str], arguments: argparse.Namespace) -> None:
@@ -110,23 +120,26 @@ def fit(rows: list[Row]) -> None:
         print(name, round(float(value), 2))
 
 
-def judge(rows: list[Row]) -> None:
-    """Print the answers by recording."""
+def judge(rows: list[Row]) -> dict[str, dict[str, int]]:
+    """Print the answers by recording, and return those of all together."""
     weights = load_appearance_weights()
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(("other: " if row["other"] else "own: ") + row["asked"], []).append(row)
     for name, group in groups.items():
         print(name, describe(count([group], weights)), sep=", ")
+    together: dict[str, dict[str, int]] = {}
     for start, name in (("own", "all own"), ("other", "all others")):
         chosen = [group for key, group in groups.items() if key.startswith(start)]
-        print(name, describe(count(chosen, weights)), sep=", ")
+        counts = count(chosen, weights)
+        print(name, describe(counts), sep=", ")
+        together[name] = dict(zip(COLUMNS, counts, strict=True))
+    return together
 
 
 def describe(counts: list[int]) -> str:
     """Return the counts as text."""
-    names = "images", "before", "now", "with the setting", "streams", "before", "now", "setting"
-    return ", ".join(f"{name} {number}" for name, number in zip(names, counts, strict=True))
+    return ", ".join(f"{name} {number}" for name, number in zip(COLUMNS, counts, strict=True))
 
 
 def count(groups: list[list[Row]], weights: AppearanceWeights) -> list[int]:

@@ -1,7 +1,7 @@
 """Milliseconds of answers and refusals, where they go, and the numbers by which a query stops.
 
-    python benchmarks/refusals.py MAP SEQ [SEQ ...] [--beside TREE] [--fast] [--light L]
-                                  [--json FILE]
+    python benchmarks/refusals.py MAP SEQ [SEQ ...] [--tree TREE] [--beside TREE] [--fast]
+                                  [--light L] [--json FILE]
     python benchmarks/refusals.py MAP SEQ [SEQ ...] --fit [--light L]
 
 Each image of each recording is asked of the map, by a process of its own. With --beside, a process
@@ -9,8 +9,9 @@ with the source code of another folder takes turns with it, image by image, so t
 changing speed meets both. The table has, for each recording and tree: images localized by nodes and
 by virtual views, and refused; their median and 95th percentile of milliseconds and the median
 processor time; the mean milliseconds of each source of proposals; and which source and feature type
-gave the reported pose. Last comes what differs between the trees. --light 0.1 asks the images
-darkened to a tenth, with noise of one grey level.
+gave the reported pose. `sift` is the processor time of OpenCV's SIFT on the same images. A
+recording that is named twice is warm the second time: its nodes were read. Last comes what differs
+between the trees. --light 0.1 asks the images darkened to a tenth, with noise of one grey level.
 
 --fit prints what a right pose shows at each step, where the numbers of `NodeStop` and `WallStop`
 come from: the inliers of the retrieved nodes of images that nodes localize, by feature type; and
@@ -32,6 +33,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from topoloc.localization import schedule
@@ -107,6 +109,7 @@ def ask(localizer: Localizer, frame: StereoFrame) -> Answer:
     answer: Answer = {
         "ms": 1e3 * (time.perf_counter() - start),
         "cpu": 1e3 * (time.process_time() - busy),
+        "sift": sift_ms(frame.image),
         "stages": result.times_ms,
         "sources": dict(spent),
     }
@@ -121,6 +124,14 @@ def ask(localizer: Localizer, frame: StereoFrame) -> Answer:
         "position": result.world_from_cam.translation.tolist(),
         "error_m": error_of(result.world_from_cam, frame)[0],
     }
+
+
+def sift_ms(image: np.ndarray) -> float:
+    """Return the processor time of OpenCV's SIFT on an image, by which machines differ."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    start = time.process_time()
+    cv2.SIFT_create().detectAndCompute(grey, None)  # pyright: ignore[reportAttributeAccessIssue]
+    return 1e3 * (time.process_time() - start)
 
 
 def error_of(world_from_cam: Any, frame: StereoFrame) -> tuple[float, float]:
@@ -157,14 +168,15 @@ class Worker:
 
 def measure(asked: argparse.Namespace) -> dict[str, dict[str, list[Answer]]]:
     """Return the answers of each tree to each recording."""
-    trees = {"here": Worker(Path(__file__).parents[1], asked)}
+    trees = {"here": Worker(asked.tree, asked)}
     if asked.beside:
         trees = {"beside": Worker(asked.beside, asked)} | trees
     for worker in trees.values():  # the first query loads kernels and nodes
         worker.ask([asked.map, asked.recordings[0], 0])
     found: dict[str, dict[str, list[Answer]]] = {}
     for recording in asked.recordings:
-        rows = found[recording] = {name: [] for name in trees}
+        name = f"{recording}, again" if recording in found else recording
+        rows = found[name] = {name: [] for name in trees}
         index = 0
         while True:
             order = list(trees.items())[:: -1 if index % 2 else 1]
@@ -191,8 +203,9 @@ def report(found: dict[str, dict[str, list[Answer]]]) -> None:
 
 def figures(rows: list[Answer]) -> str:
     ms, cpu = ([row[name] for row in rows] for name in ("ms", "cpu"))
+    sift = np.median([row["sift"] for row in rows])
     parts = [f"{len(rows):4} median {np.median(ms):4.0f} p95 {np.percentile(ms, 95):4.0f} ms,"]
-    parts.append(f"processor {np.median(cpu):4.0f} ms;")
+    parts.append(f"processor {np.median(cpu):4.0f} ms, sift {sift:.0f};")
     for name in ("stages", "sources"):
         total: Counter[str] = Counter()
         for row in rows:
@@ -283,6 +296,7 @@ def main() -> None:
     )
     parser.add_argument("map", nargs="?")
     parser.add_argument("recordings", nargs="*")
+    parser.add_argument("--tree", type=Path, default=Path(__file__).parents[1])
     parser.add_argument("--beside", type=Path, help="folder with other source code")
     parser.add_argument("--fast", action="store_true", help="without the last step")
     parser.add_argument("--light", type=float, default=1.0)

@@ -2,6 +2,7 @@
 pictures in the same run.
 
     python benchmarks/service.py MAP QUERIES [--requests 2000] [--clients 4] [--maps 20]
+        [--speed] [--json FILE]
 
 Prints one line a question: pictures a second by one thread and by as many threads as there are
 processors here, then by the service; times of answers at 80 % of that; with 30 % pictures of
@@ -164,6 +165,8 @@ def main() -> None:
     parser.add_argument("--requests", type=int, default=2000)
     parser.add_argument("--clients", type=int, default=4)
     parser.add_argument("--maps", type=int, default=20)
+    parser.add_argument("--speed", action="store_true", help="the rates and times alone")
+    parser.add_argument("--json", type=Path, help="write rates and times to this file")
     args = parser.parse_args()
     frames = open_sequence(args.queries)
     camera = frames[0].camera
@@ -171,14 +174,19 @@ def main() -> None:
     clear = [encode_jpeg(frames[i].image, 90) for i in range(min(len(frames), 24))]
     set_num_threads(1)
     with TopoMetricMap.load(args.map) as topomap:
-        speed(args, Localizer(topomap), camera, clear)
+        figures = speed(args, Localizer(topomap), camera, clear)
+        if args.json:
+            args.json.write_text(json.dumps(figures, indent=1))
+        if args.speed:
+            return
         under_garbage(args, camera, clear)
         many_maps(args, Localizer(topomap), camera, clear)
 
 
 def speed(
     args: argparse.Namespace, localizer: Localizer, camera: Camera, clear: list[bytes]
-) -> None:
+) -> dict[str, float]:
+    """Print the rates and times, and return them: of this process, then of the service."""
     name, num = args.map.stem, max(len(clear), args.requests // 10)
     many = [clear[i % len(clear)] for i in range(num)]
     in_process(localizer, camera, clear, 1)
@@ -205,7 +213,15 @@ def speed(
         )
         mixed = [elsewhere if i % 10 < 3 else picture for i, picture in enumerate(many)]
         print(f"30 % of elsewhere: {load(of, name, camera, mixed, args.clients)[0]:.1f}/s")
-    print(f"in process again: {in_process(localizer, camera, many, threads):.1f}/s by {threads}")
+    again = in_process(localizer, camera, many, threads)
+    print(f"in process again: {again:.1f}/s by {threads}")
+    return {
+        "in_process_per_s": max(together, again),
+        "service_per_s": rate,
+        "median_ms": median,
+        "p99_ms": p99,
+        "not_answered": len(many) - statuses[200],
+    }
 
 
 def under_garbage(args: argparse.Namespace, camera: Camera, clear: list[bytes]) -> None:

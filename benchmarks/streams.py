@@ -1,6 +1,7 @@
 """Streams: what is asked of the tracker beside what is measured.
 
     python benchmarks/streams.py [--shared ../shared] [--stream NAME MAP_SEQ STREAM_SEQ ...]
+        [--only NAME] [--json FILE]
 
 Maps one recording (or part of one) and streams another: 7-Scenes' kitchen, one frame in four mapped
 and the others streamed; the ZED camera's second session in a map of its first; the demo's lab by
@@ -78,6 +79,7 @@ def main() -> None:
         "--stream", nargs=3, action="append", default=[], metavar=("NAME", "MAP_SEQ", "STREAM_SEQ")
     )
     parser.add_argument("--only", help="the name of one stream")
+    parser.add_argument("--json", type=Path, help="write the figures of each stream to this file")
     args = parser.parse_args()
     cv2.setNumThreads(2)
     pairs = [
@@ -87,9 +89,9 @@ def main() -> None:
             for name, mapped, streamed in args.stream
         ),
     ]
-    for pair in pairs:
-        if args.only in (None, pair.name):
-            judge(pair)
+    figures = {pair.name: judge(pair) for pair in pairs if args.only in (None, pair.name)}
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=1))
 
 
 def known_pairs(shared: Path) -> list[Pair]:
@@ -114,7 +116,8 @@ def known_pairs(shared: Path) -> list[Pair]:
     ]
 
 
-def judge(pair: Pair) -> None:
+def judge(pair: Pair) -> dict[str, float]:
+    """Print the figures of a stream, and return the main ones."""
     localizer = Localizer(build_map([open_sequence(path) for path in pair.mapped]))
     sequence = as_monocular(open_sequence(pair.streamed))
     frames = [
@@ -181,6 +184,16 @@ def judge(pair: Pair) -> None:
     )
     row("processor time of all frames, mean", "", f"{np.mean(cpu_ms):.1f} ms")
     row("frames a second, pictures in memory", "", f"{len(frames) / seconds:.1f}")
+    return {
+        "frames": len(frames),
+        "measured": int(np.sum(measured)),
+        "lost": states["lost"] + states["ambiguous"],
+        "beyond_50_cm": int(np.sum(np.array(errors) > 0.5)),
+        "largest_cm": 100 * max(errors),
+        "median_cm": 100 * float(np.median(errors)),
+        "inside": round(len(frames) * share_inside(answers, truths)),
+        "jitter_ratio": ratio,
+    }
 
 
 def _camera(frame: StereoFrame):

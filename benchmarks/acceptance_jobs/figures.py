@@ -20,15 +20,16 @@ Value = int | float | str | None
 class Figure:
     """Hold one measured value.
 
-    The rule is `at least` or `at most` (counts, exact), `equal`, `median` (errors, bytes, memory:
-    may rise by 5 %), `time` (a ratio to OpenCV's SIFT: may rise by 20 %) or `budget` (may rise by
-    3 %). A figure with `skipped` has no value.
+    The rule is `at least` or `at most` (counts, exact but for `slack`), `equal`, `median` (errors,
+    bytes, memory: may rise by 5 %), `time` (a ratio to OpenCV's SIFT: may rise by 20 %), `budget`
+    (may rise by 3 %) or `note` (never worse). A figure with `skipped` has no value.
     """
 
     name: str
     value: Value
     rule: str = "equal"
     skipped: str = ""
+    slack: int = 0
 
 
 @dataclass(frozen=True)
@@ -51,19 +52,21 @@ class Row:
         return f"{self.job:12} {self.figure:58} {values}  {self.verdict}"
 
 
-def verdict(rule: str, committed: Value, now: Value) -> str:
-    """Return `same`, `better` or `worse`.
+def verdict(rule: str, committed: Value, now: Value, slack: int = 0) -> str:
+    """Return `same`, `better` or `worse`. A count may be worse by the slack.
 
     Raises:
         ValueError: The rule is unknown.
     """
+    if rule == "note":
+        return "same" if committed == now else "other"
     if rule == "equal":
         return "same" if committed == now else "worse"
     if not isinstance(committed, int | float) or not isinstance(now, int | float):
         return "same" if committed == now else "worse"
     if rule in ("at least", "at most"):
         rise = now - committed if rule == "at most" else committed - now
-        return "same" if rise == 0 else "worse" if rise > 0 else "better"
+        return "better" if rise < 0 else "same" if rise <= slack else "worse"
     if rule not in MAX_RISE:
         raise ValueError(f"unknown rule {rule!r}")
     share = MAX_RISE[rule]
@@ -83,7 +86,7 @@ def compare(job: str, figures: list[Figure], committed: Mapping[str, Any]) -> li
         elif known is None:
             rows.append(Row(job, figure.name, None, figure.value, "new: not committed yet"))
         else:
-            now = verdict(figure.rule, known["value"], figure.value)
+            now = verdict(figure.rule, known["value"], figure.value, figure.slack)
             rows.append(Row(job, figure.name, known["value"], figure.value, now))
     measured = {figure.name for figure in figures}
     for name in sorted(committed.keys() - measured):

@@ -110,13 +110,14 @@ class Workplace:
     quick: bool
     equal_to: str
     cache: Path
+    tree: Path = ROOT
     _known: dict[str, Path] = field(default_factory=dict)
 
     def job_folder(self) -> Workplace:
         """Return the workplace of one job, with a new folder."""
         folder = Path(tempfile.mkdtemp(dir=self.folder))
         return Workplace(
-            folder, self.maps, self.shared, self.quick, self.equal_to, self.cache, self._known
+            folder, self.maps, self.shared, self.quick, self.equal_to, self.cache, self.tree
         )
 
     def python(self, *words: object, timeout: float = 300, status: int | None = 0) -> str:
@@ -125,7 +126,7 @@ class Workplace:
         Raises:
             JobError: The exit status is another one (None: any), or a traceback was printed.
         """
-        code, out, err = run([sys.executable, *words], self.folder, timeout=timeout)
+        code, out, err = run([sys.executable, *words], self.folder, self.tree, timeout)
         if "Traceback (most recent call last)" in err:
             raise JobError(f"traceback: {last_line(err)}")
         if status is not None and code != status:
