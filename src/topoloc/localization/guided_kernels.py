@@ -8,6 +8,24 @@ from topoloc.compiled import kernel
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
+def _order_by_cell(key_points, radius, num_columns, num_rows):
+    """Return the rows of key points by cell of a grid, and the first position of each cell."""
+    cells = np.empty(len(key_points), np.int64)
+    starts = np.zeros(num_columns * num_rows + 1, np.int64)
+    for k in range(len(key_points)):
+        column = min(max(int(key_points[k, 0] / radius), 0), num_columns - 1)
+        row = min(max(int(key_points[k, 1] / radius), 0), num_rows - 1)
+        cells[k] = row * num_columns + column
+        starts[cells[k] + 1] += 1
+    starts = np.cumsum(starts)
+    order, free = np.empty(len(key_points), np.int64), starts.copy()
+    for k in range(len(key_points)):  # keeps the order within a cell
+        order[free[cells[k]]] = k
+        free[cells[k]] += 1
+    return order, starts
+
+
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"})
 def match_projections(
     predicted,
     map_descriptors,
@@ -32,18 +50,7 @@ def match_projections(
     within two pixels (L1) of it are exempt, because they are one blob at two scales.
     """
     num_columns, num_rows = int(width / radius) + 1, int(height / radius) + 1
-    num_cells, cells = num_columns * num_rows, np.empty(len(key_points), np.int64)
-    starts = np.zeros(num_cells + 1, np.int64)
-    for k in range(len(key_points)):
-        column = min(max(int(key_points[k, 0] / radius), 0), num_columns - 1)
-        row = min(max(int(key_points[k, 1] / radius), 0), num_rows - 1)
-        cells[k] = row * num_columns + column
-        starts[cells[k] + 1] += 1
-    starts = np.cumsum(starts)
-    order, free = np.empty(len(key_points), np.int64), starts.copy()
-    for k in range(len(key_points)):  # keeps the order within a cell
-        order[free[cells[k]]] = k
-        free[cells[k]] += 1
+    order, starts = _order_by_cell(key_points, radius, num_columns, num_rows)
     # by cell, so that the key points of neighbouring cells are read one after the other
     sorted_points = np.empty((5, len(key_points)), np.float32)
     for position in range(len(order)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,11 +16,11 @@ from topoloc.errors import TrainingError
 from topoloc.retrieval.cnn_fc import NAME, NodeClassifier
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.inference import BATCH_SIZE, to_channels_last
-from topoloc.retrieval.network_images import BackboneName, prepare_network_images
+from topoloc.retrieval.network_images import BackboneName, ImageShape, prepare_network_images
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.frozen_maps import FrozenMaps, plain_maps
 from topoloc_training.stored_weights import rounded_to_half, to_arrays
-from topoloc_training.training import Task, deterministic, fit, hold_out
+from topoloc_training.training import Task, Training, deterministic, fit, hold_out
 from topoloc_training.training_set import Progress, TrainingSet, decode_pictures
 from topoloc_training.weights import Weights, describe
 
@@ -90,27 +91,35 @@ def train(
         if held_out.any()
         else 1.0
     )
-    facts = {
+    start = _facts_of_start(backbone, weights, config, shape)
+    trained = _facts_of(done) | {
+        "num_held_out": int(held_out.sum()),
+        "widened_from": None if weights is None else weights.num_outputs,
+    }
+    facts = {"num_nodes": training_set.num_nodes, "temperature": temperature}
+    settings = start | {"trained": trained} | facts
+    return CoarseModel(NAME, settings, to_arrays(network))
+
+
+def _facts_of_start(
+    backbone: BackboneName, weights: Weights | None, config: CnnFcConfig, shape: ImageShape
+) -> dict[str, Any]:
+    """Return the settings from which a training starts, as a map stores them."""
+    return {
         "backbone": backbone,
         "weights": describe(weights),
         "config": asdict(config),
         "picture_shape": [shape.width, shape.height],
     }
-    ended = {
+
+
+def _facts_of(done: Training) -> dict[str, Any]:
+    """Return the facts of a training that a map stores."""
+    return {
         "epochs": len(done.scores),
         "best_epoch": done.best_epoch,
         "stopped_by": done.stopped_by,
     }
-    trained = ended | {
-        "num_held_out": int(held_out.sum()),
-        "widened_from": None if weights is None else weights.num_outputs,
-    }
-    settings = facts | {
-        "trained": trained,
-        "num_nodes": training_set.num_nodes,
-        "temperature": temperature,
-    }
-    return CoarseModel(NAME, settings, to_arrays(network))
 
 
 def soft_labels(training_set: TrainingSet, spread: float) -> Float32[np.ndarray, "n nodes"]:

@@ -138,21 +138,19 @@ def train(config: TrainNet) -> None:
         follow(average, network, min(_KEPT_AVERAGE, step / (step + 20)))
         sums += [float(part.detach()) for part in parts]
         if step % _LOG_EVERY == 0:
-            names = ("cosine", "to_teacher", "across_light", "score", "place")
-            line = {
-                "step": step,
-                "rate": schedule.get_last_lr()[0],
-                "seconds": round(time.monotonic() - since, 1),
-            }
-            _log(
-                config.out,
-                line
-                | {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)},
-            )
+            _log_means(config.out, step, schedule.get_last_lr()[0], since, sums)
             sums, since = np.zeros(5), time.monotonic()
         if step % _SAVE_EVERY == 0:
             _save(config, network, average, optimizer, step)
     _save(config, network, average, optimizer, step)
+
+
+def _log_means(out: Path, step: int, rate: float, since: float, sums: np.ndarray) -> None:
+    """Log the mean losses of the last steps, and the seconds that they took."""
+    names = ("cosine", "to_teacher", "across_light", "score", "place")
+    line = {"step": step, "rate": rate, "seconds": round(time.monotonic() - since, 1)}
+    means = {n: round(float(v) / _LOG_EVERY, 4) for n, v in zip(names, sums, strict=True)}
+    _log(out, line | means)
 
 
 def _step(network: TopolocNet, samples: list[Sample]) -> tuple[Tensor, ...]:

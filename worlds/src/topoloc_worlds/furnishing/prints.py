@@ -224,6 +224,43 @@ def whiteboard(rng: np.random.Generator, size: tuple[int, int] = (640, 960)) -> 
         h * 0.05,
         (0.83, 0.83, 0.86),
     )
+    _draw_diagram(picture, rng, inks)
+    for k in range(int(rng.integers(3, 6))):
+        text = str(
+            rng.choice(
+                [
+                    "E(T) = sum |x - K T X|^2",
+                    "p(z|x) ~ N(0, S)",
+                    "d = f b / Z",
+                    "R = exp(w^)",
+                    "x' F x = 0",
+                    "A x = b",
+                    "todo: calibrate",
+                    "s(q,n) > 0.7",
+                ]
+            )
+        )
+        at = (w * rng.uniform(0.05, 0.1), h * (0.58 + 0.09 * k))
+        write(
+            picture, text, at, h * rng.uniform(0.05, 0.08), inks[int(rng.integers(0, 4))], w * 0.45
+        )
+    for k in range(int(rng.integers(3, 8))):
+        write(
+            picture,
+            f"- {sentence(rng, int(rng.integers(2, 5)))}",
+            (w * 0.56, h * (0.2 + 0.09 * k)),
+            h * 0.055,
+            inks[int(rng.integers(0, 4))],
+            w * 0.4,
+        )
+    return picture
+
+
+def _draw_diagram(
+    picture: Picture, rng: np.random.Generator, inks: tuple[tuple[float, float, float], ...]
+) -> None:
+    """Draw three labelled boxes, joined by arrows, into the left half of a picture."""
+    h, w = picture.shape[:2]
     nodes = [(w * (0.12 + 0.16 * k), h * (0.25 + 0.2 * rng.uniform())) for k in range(3)]
     for k, (x, y) in enumerate(nodes):
         ink = to_bytes(inks[int(rng.integers(0, 4))])
@@ -254,35 +291,6 @@ def whiteboard(rng: np.random.Generator, size: tuple[int, int] = (640, 960)) -> 
                 cv2.LINE_AA,
                 tipLength=0.15,
             )
-    for k in range(int(rng.integers(3, 6))):
-        text = str(
-            rng.choice(
-                [
-                    "E(T) = sum |x - K T X|^2",
-                    "p(z|x) ~ N(0, S)",
-                    "d = f b / Z",
-                    "R = exp(w^)",
-                    "x' F x = 0",
-                    "A x = b",
-                    "todo: calibrate",
-                    "s(q,n) > 0.7",
-                ]
-            )
-        )
-        at = (w * rng.uniform(0.05, 0.1), h * (0.58 + 0.09 * k))
-        write(
-            picture, text, at, h * rng.uniform(0.05, 0.08), inks[int(rng.integers(0, 4))], w * 0.45
-        )
-    for k in range(int(rng.integers(3, 8))):
-        write(
-            picture,
-            f"- {sentence(rng, int(rng.integers(2, 5)))}",
-            (w * 0.56, h * (0.2 + 0.09 * k)),
-            h * 0.055,
-            inks[int(rng.integers(0, 4))],
-            w * 0.4,
-        )
-    return picture
 
 
 def calendar(rng: np.random.Generator, size: tuple[int, int] = (480, 320)) -> Picture:

@@ -29,7 +29,6 @@ from topoloc_worlds.furnishing.desktop_things import (
     telephone,
 )
 from topoloc_worlds.furnishing.furniture import (
-    bookshelf,
     carton_box,
     coat_rack,
     crate,
@@ -44,6 +43,7 @@ from topoloc_worlds.furnishing.interiors import Finishes, finishes_of, plastic, 
 from topoloc_worlds.furnishing.pictures import photograph
 from topoloc_worlds.furnishing.printed_things import door_sign, exit_sign
 from topoloc_worlds.furnishing.prints import calendar, notice, notice_board, poster
+from topoloc_worlds.furnishing.shelves import bookshelf
 from topoloc_worlds.lab.shell import (
     CEILING_LAMPS,
     DARK,

@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from topoloc_worlds.scene import Mesh
-from topoloc_worlds.shapes import box, join, panel
+from topoloc_worlds.scene import Mesh, Surface
+from topoloc_worlds.shapes import box, join, panel, placed
 from topoloc_worlds.street.textures import WALL_METRES
 
 Span = tuple[float, float]
@@ -216,3 +216,8 @@ def side_walls(width: float, depth: float, height: float, which: str) -> list[Me
         # The wall's foot, where its picture is damp, belongs on the ground.
         result.append(Mesh(mesh.vertices, mesh.faces, mesh.uv + np.array([0.0, 1.0 - uv_height])))
     return result
+
+
+def set_at(surfaces: list[Surface], at: tuple[float, float, float], yaw: float) -> list[Surface]:
+    """The same things elsewhere."""
+    return [Surface(s.name, placed(s.mesh, at, yaw), s.material) for s in surfaces]

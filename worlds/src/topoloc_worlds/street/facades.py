@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from topoloc_worlds.scene import Material, Mesh, Surface
-from topoloc_worlds.shapes import box, cylinder, join, panel, placed, tube
+from topoloc_worlds.shapes import box, cylinder, join, panel, tube
 from topoloc_worlds.street.facade_parts import (
     Openings,
     balcony,
@@ -396,8 +396,3 @@ def office(
     ]
     parts += [("roof", panel((0.0, depth, height), (width, 0, 0), (0, -depth, 0)), kit.concrete)]
     return [Surface(name, mesh, what) for name, mesh, what in parts]
-
-
-def set_at(surfaces: list[Surface], at: tuple[float, float, float], yaw: float) -> list[Surface]:
-    """The same things elsewhere."""
-    return [Surface(s.name, placed(s.mesh, at, yaw), s.material) for s in surfaces]

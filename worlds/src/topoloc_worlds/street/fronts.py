@@ -10,7 +10,8 @@ from topoloc_worlds.furnishing.lettering import to_bytes
 from topoloc_worlds.noise import rng_of, smooth_noise
 from topoloc_worlds.scene import Material, Mesh, Picture, Surface
 from topoloc_worlds.shapes import box, join, panel, placed
-from topoloc_worlds.street.facades import STYLES, house, office, set_at
+from topoloc_worlds.street.facade_parts import set_at
+from topoloc_worlds.street.facades import STYLES, house, office
 from topoloc_worlds.street.furniture import FurnitureMaterials
 from topoloc_worlds.street.materials import StreetMaterials
 from topoloc_worlds.street.roads import HALF_LENGTH, HALF_WIDTH, PAVEMENT

@@ -17,7 +17,7 @@ from topoloc_worlds.noise import rng_of
 from topoloc_worlds.scene import Haze, Mesh, Scene, Sky, Surface
 from topoloc_worlds.shapes import tube
 from topoloc_worlds.skies import sky_of
-from topoloc_worlds.street.facades import set_at
+from topoloc_worlds.street.facade_parts import set_at
 from topoloc_worlds.street.fronts import fronts
 from topoloc_worlds.street.furniture import (
     FurnitureMaterials,
