@@ -16,10 +16,12 @@ import numpy as np
 from made_once import once_a_run
 from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
 from topoloc.features.feature_types import default_learned_type
+from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoFrame
@@ -151,3 +153,24 @@ def seen_ahead() -> list[tuple[np.ndarray, Rigid3]]:
         (render(corridor(), pose, WIDE, noise_seed=700 + k)[0], pose)
         for k, pose in enumerate(poses)
     ]
+
+
+def is_right(result: Localization | NotLocalized, truth: Rigid3) -> bool:
+    """Return whether a result is a pose within 0.3 m and 5 degrees of the truth."""
+    return isinstance(result, Localization) and is_pose(result.world_from_cam, truth)
+
+
+def is_by_walls(result: Localization | NotLocalized) -> bool:
+    """Return whether virtual views localized the image."""
+    return (
+        isinstance(result, Localization)
+        and result.evidence is not None
+        and result.evidence.num_distinct is not None
+    )
+
+
+def is_pose(world_from_cam: Rigid3, truth: Rigid3) -> bool:
+    """Return whether a pose is within 0.3 m and 5 degrees of the truth."""
+    return translation_error(world_from_cam, truth) < 0.3 and rotation_error(
+        world_from_cam, truth
+    ) < np.deg2rad(5.0)

@@ -4,11 +4,8 @@ no other images."""
 from __future__ import annotations
 
 import math
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,32 +14,27 @@ from msgspec import structs
 
 from built_corridor import (
     WIDE,
-    WalkAhead,
     back,
     built_corridor,
     corridor,
     corridor_of_two_kinds,
+    is_by_walls,
+    is_pose,
+    is_right,
     seen_ahead,
     seen_on_the_way_back,
 )
 from tiny_world import path_pose, render, room
-from topoloc.errors import MapError
 from topoloc.features.feature_types import (
-    FEATURE_TYPES,
     SURF,
-    FeatureConfig,
-    default_learned_type,
-    find_feature_type,
 )
 from topoloc.features.features import Features
-from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import VirtualViewSearchConfig
 from topoloc.localization.fitted_weights import WallStop, load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.query import Deadline, Query, QueryImage, StageClock
 from topoloc.localization.result import Localization, NotLocalized
@@ -54,7 +46,6 @@ from topoloc.localization.walls import (
 from topoloc.localization.walls.place_comparison import Comparison
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
-from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes
 
 NO_WALLS = LocalizerConfig(walls=VirtualViewSearchConfig(num_places=0))
@@ -72,32 +63,14 @@ def _found_on_the_way_back() -> list[tuple[Localization | NotLocalized, Rigid3]]
     return [(localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()]
 
 
-def _is_right(result: Localization | NotLocalized, truth: Rigid3) -> bool:
-    return isinstance(result, Localization) and _is_pose(result.world_from_cam, truth)
-
-
-def _is_by_walls(result: Localization | NotLocalized) -> bool:
-    return (
-        isinstance(result, Localization)
-        and result.evidence is not None
-        and result.evidence.num_distinct is not None
-    )
-
-
-def _is_pose(world_from_cam: Rigid3, truth: Rigid3) -> bool:
-    return translation_error(world_from_cam, truth) < 0.3 and rotation_error(
-        world_from_cam, truth
-    ) < np.deg2rad(5.0)
-
-
 def test_the_reverse_direction_is_localized_by_virtual_views():
-    assert all(_is_right(result, truth) for result, truth in _found_on_the_way_back())
+    assert all(is_right(result, truth) for result, truth in _found_on_the_way_back())
     without = Localizer(built_corridor(), NO_WALLS)
     answers = [
         (without.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()
     ]
     answered = [
-        _is_right(result, truth) for result, truth in answers if isinstance(result, Localization)
+        is_right(result, truth) for result, truth in answers if isinstance(result, Localization)
     ]
     assert len(answered) < 0.5 * len(answers)  # localized by node viewpoints
     assert all(answered)
@@ -108,7 +81,7 @@ def test_a_pose_of_virtual_views_contains_its_evidence(localizer: Localizer):
     assert topomap.sides is not None
     with_sides = {summary.name for summary in topomap.sides.summaries}
     by_walls = [
-        (result, truth) for result, truth in _found_on_the_way_back() if _is_by_walls(result)
+        (result, truth) for result, truth in _found_on_the_way_back() if is_by_walls(result)
     ]
     assert len(by_walls) >= 3
     for result, truth in by_walls:
@@ -169,7 +142,7 @@ def test_virtual_views_of_a_query_are_made_once_for_all_maps(
 def test_a_distorted_camera_is_localized_in_reverse_direction(localizer: Localizer):
     truth = back(5.2, x=0.1, yaw=0.04)
     picture, _ = render(corridor(), truth, DISTORTED, noise_seed=3)
-    assert _is_right(localizer.localize(picture, DISTORTED), truth)
+    assert is_right(localizer.localize(picture, DISTORTED), truth)
 
 
 def test_images_in_the_mapped_direction_have_the_result_without_virtual_views(localizer: Localizer):
@@ -257,9 +230,9 @@ def test_repeated_virtual_views_give_no_pose():
     results = [
         (localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()[::2]
     ]
-    assert not any(_is_by_walls(result) for result, _ in results)
+    assert not any(is_by_walls(result) for result, _ in results)
     assert all(
-        _is_right(result, truth) for result, truth in results if isinstance(result, Localization)
+        is_right(result, truth) for result, truth in results if isinstance(result, Localization)
     )  # of viewpoints
 
 
@@ -354,11 +327,11 @@ def test_poses_in_the_direction_of_nodes_are_left_to_the_nodes(
     monkeypatch.setattr(VirtualViewSearchConfig, "min_distance", 0.0)
     picture, truth = seen_ahead()[1]
     assert not any(
-        _is_pose(one.world_from_cam, truth) for one in _by_the_walls(built_corridor(), picture)
+        is_pose(one.world_from_cam, truth) for one in _by_the_walls(built_corridor(), picture)
     )
     monkeypatch.undo()
     picture, truth = seen_on_the_way_back()[2]
-    assert _is_pose(_by_the_walls(built_corridor(), picture)[0].world_from_cam, truth)
+    assert is_pose(_by_the_walls(built_corridor(), picture)[0].world_from_cam, truth)
     monkeypatch.setattr(VirtualViewSearchConfig, "min_distance", 1e3)
     assert _by_the_walls(built_corridor(), picture) == []
 
@@ -369,83 +342,10 @@ def test_repeated_virtual_views_have_lower_odds():
     once, twice = (
         _by_the_walls(m, picture) for m in (built_corridor(), _twice(built_corridor(), apart=60.0))
     )
-    assert _is_pose(once[0].world_from_cam, truth)
+    assert is_pose(once[0].world_from_cam, truth)
     assert len(twice) >= 2
     assert not any(hypothesis.evidence.is_of_nodes for hypothesis in (*once, *twice))
     assert once[0].log_odds > twice[0].log_odds + 0.5
     assert twice[0].log_odds >= twice[1].log_odds
     ways = [hypothesis.world_from_cam.translation[1] for hypothesis in twice]
     assert sorted(round((way - truth.translation[1]) / 60.0) for way in ways[:2]) == [0, 1]
-
-
-def test_learned_features_use_the_virtual_views_of_the_map(tmp_path: Path):
-    path = tmp_path / "corridor.topo"
-    corridor_of_two_kinds().save(path)
-    loaded = TopoMetricMap.load(path)
-    assert loaded.sides is not None
-    assert (
-        loaded.sides.kind == find_feature_type(loaded.kinds[1]).virtual_view_type != loaded.kinds[1]
-    )
-    assert loaded.sides_for(loaded.kinds[1]) is loaded.sides
-    localizer, learned = (
-        Localizer(loaded),
-        Localizer(loaded, LocalizerConfig(kinds=(loaded.kinds[1],))),
-    )
-    for picture, truth in seen_on_the_way_back()[::2]:
-        assert _is_right(localizer.localize(picture, WIDE), truth)
-        result = learned.localize(picture, WIDE)
-        assert _is_by_walls(result)
-        assert _is_right(result, truth)
-        mirrored = np.ascontiguousarray(picture[:, ::-1])
-        assert isinstance(localizer.localize(mirrored, WIDE), NotLocalized)
-    assert Localizer(loaded, LocalizerConfig(kinds=("surf",))).context.first.map.walls is None
-    with closing(sqlite3.connect(path)) as database:
-        database.execute("UPDATE map SET value = '\"sift\"' WHERE key = 'kind_of_sides'")
-        database.commit()
-    with pytest.raises(MapError, match="kind_of_sides"):
-        TopoMetricMap.load(path)
-
-
-def test_virtual_views_of_the_nodes_feature_type_are_still_used(monkeypatch: pytest.MonkeyPatch):
-    network = default_learned_type()
-    with monkeypatch.context() as patch:  # like maps before the network for virtual views
-        patch.setitem(FEATURE_TYPES, network, replace(FEATURE_TYPES[network], sides=None))
-        topomap = build_map(
-            WalkAhead(0), BuildConfig(features=FeatureConfig(kind=network), other_kinds=())
-        )
-    assert topomap.sides is not None
-    assert topomap.sides.kind == network
-    localizer = Localizer(topomap)
-    assert localizer.context.first.weights.walls == load_fitted_weights(network).walls
-    for picture, truth in seen_on_the_way_back()[::2]:
-        result = localizer.localize(picture, WIDE)
-        assert _is_by_walls(result)
-        assert _is_right(result, truth)
-
-
-def test_a_map_from_a_file_gives_the_same_result(tmp_path: Path):
-    path = tmp_path / "corridor.topo"
-    built_corridor().save(path)
-    picture, truth = seen_on_the_way_back()[1]
-    assert _is_right(Localizer(TopoMetricMap.load(path)).localize(picture, WIDE), truth)
-
-
-SPOILT = {
-    "no coarse model": "DELETE FROM side_coarse_models",
-    "the model of the nodes": (
-        "UPDATE side_coarse_models SET arrays = (SELECT arrays FROM coarse_models)"
-    ),
-}
-
-
-@pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT.keys())
-def test_virtual_views_that_cannot_be_ranked_are_a_map_error(tmp_path: Path, change: str):
-    path = tmp_path / "corridor.topo"
-    built_corridor().save(path)
-    database = sqlite3.connect(path)
-    database.executescript(change)
-    database.close()
-    localizer = Localizer(TopoMetricMap.load(path))
-    assert isinstance(localizer.localize(seen_ahead()[0][0], WIDE), Localization)
-    with pytest.raises(MapError, match="side_coarse_models"):
-        localizer.localize(seen_on_the_way_back()[0][0], WIDE)
