@@ -138,7 +138,7 @@ def train(config: TrainNet) -> None:
         follow(average, network, min(_KEPT_AVERAGE, step / (step + 20)))
         sums += [float(part.detach()) for part in parts]
         if step % _LOG_EVERY == 0:
-            _log_means(config.out, step, schedule.get_last_lr()[0], since, sums)
+            _log_means(config.out, step, float(schedule.get_last_lr()[0]), since, sums)
             sums, since = np.zeros(5), time.monotonic()
         if step % _SAVE_EVERY == 0:
             _save(config, network, average, optimizer, step)
