@@ -59,8 +59,9 @@ class Bench:
 
     def map(self, name: str, recording: object, *options: object) -> Path:
         """Return a map by the source tree, built once."""
-        path = self.work / "maps" / f"{name}-{self.digest}.topo"
-        with self._locks.setdefault(name, threading.Lock()):
+        built = f"{name}-{_short((str(recording), options))}"
+        path = self.work / "maps" / f"{built}-{self.digest}.topo"
+        with self._locks.setdefault(built, threading.Lock()):
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
                 self.topoloc("build", recording, path, *options)
@@ -98,7 +99,8 @@ class Bench:
     def _run(self, *words: object) -> None:
         code, out, err = run([sys.executable, *words], self.folder(), self.tree, _TIMEOUT_S)
         if code != 0:
-            raise JobError(f"{Path(str(words[0])).name}: {last_line(err) or last_line(out)}")
+            script = Path(str(words[0])).name
+            raise JobError(f"{script}: exit status {code}: {last_line(err) or last_line(out)}")
 
 
 def figures_of(

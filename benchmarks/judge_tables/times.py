@@ -49,7 +49,8 @@ def _rows_of(name: str, answers: Sequence[Mapping[str, Any]]) -> Iterator[Figure
         rows = [row for row in answers if row["kind"] == kind]
         if not rows:
             continue
-        yield Figure(f"{name}, {kind}: images", len(rows), "note")
+        rule = "note" if kind == "refused" else "at least"
+        yield Figure(f"{name}, {kind}: images", len(rows), rule)
         sift = float(np.median([row["sift"] for row in answers]))
         for part, share in (("median", 50), ("p95", 95)):
             busy = float(np.percentile([row["cpu"] for row in rows], share)) / sift
