@@ -42,8 +42,8 @@ def attach_stub(
     return load, lambda: list(names), names
 
 
-_load, __dir__, __all__ = attach_stub(__name__, __file__)
-__all__ += ["__version__"]
+_load, _, _names = attach_stub(__name__, __file__)
+__all__ = sorted([*_names, "__version__"])
 
 
 def __getattr__(name: str) -> Any:
@@ -52,3 +52,7 @@ def __getattr__(name: str) -> Any:
 
         return version("topoloc")
     return _load(name)
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

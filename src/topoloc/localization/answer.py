@@ -17,6 +17,7 @@ from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
+from topoloc.json_data import OneLine
 from topoloc.localization.belief import (
     Hypothesis,
     log_odds_margin,
@@ -42,8 +43,8 @@ ResultWithInliers = tuple[Localization | NotLocalized, list[LocalizationWithInli
 """A result with each reported pose and its inliers: its own pose, or its alternatives in order."""
 
 
-@dataclass(frozen=True, eq=False)
-class Finding:
+@dataclass(frozen=True, eq=False, repr=False)
+class Finding(OneLine):
     """Hold what a check found about an answer.
 
     `text` states it in one line. `factor` multiplies the probability. `facts` holds new values of
