@@ -7,43 +7,43 @@ gets a metric 6-DoF pose.
 
 from __future__ import annotations
 
-import ast
-import importlib
-import os
 import sys
 from collections.abc import Callable
 from typing import Any
 
 
-def attach_stub(
-    module: str, file: str
-) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a module: the names that its stub imports.
+def attach_stub(module: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a module: the names that its stub imports.
 
     `file` is the file of the module. The stub is the .pyi file beside it, which type checkers and
-    editors read, too."""
-    with open(os.path.splitext(file)[0] + ".pyi", encoding="utf-8") as stub:
-        tree = ast.parse(stub.read())
-    sources = {
-        alias.name: node.module
-        for node in tree.body
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("topoloc.")
-        for alias in node.names
-    }
-    names = sorted(sources)
+    editors read, too. It is read at the first use of a name."""
+    sources: dict[str, str] = {}
+
+    def names() -> list[str]:
+        if not sources:
+            import ast
+            from pathlib import Path
+
+            for node in ast.parse(Path(file).with_suffix(".pyi").read_text("utf-8")).body:
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("topoloc."):
+                    sources.update({alias.name: str(node.module) for alias in node.names})
+        return sorted(sources)
 
     def load(name: str) -> Any:
-        if name not in sources:
+        if name == "__all__":
+            return names()
+        if name not in names():
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        import importlib
+
         value = getattr(importlib.import_module(sources[name]), name)
         setattr(sys.modules[module], name, value)
         return value
 
-    return load, lambda: list(names), names
+    return load, names
 
 
-_load, _, _names = attach_stub(__name__, __file__)
-__all__ = sorted([*_names, "__version__"])
+_load, _names = attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
@@ -51,8 +51,8 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("topoloc")
-    return _load(name)
+    return __dir__() if name == "__all__" else _load(name)
 
 
 def __dir__() -> list[str]:
-    return list(__all__)
+    return sorted([*_names(), "__version__"])

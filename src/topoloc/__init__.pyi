@@ -118,9 +118,7 @@ from topoloc.tracking.stream_result import StreamedPose as StreamedPose
 from topoloc.tracking.tracker import Tracker as Tracker
 from topoloc.tracking.warm_up import warm_up as warm_up
 
-def attach_stub(
-    module: str, file: str
-) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]: ...
+def attach_stub(module: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]: ...
 
 __version__: str
 __all__: list[str]

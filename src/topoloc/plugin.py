@@ -7,4 +7,4 @@ module at its first use, so that importing this module is free.
 
 from topoloc import attach_stub
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+__getattr__, __dir__ = attach_stub(__name__, __file__)
