@@ -36,8 +36,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from topoloc.localization import schedule
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.proposals.propose import propose_first
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search, Trace
@@ -244,7 +244,7 @@ def fit(path: str, recordings: list[str], light: float) -> None:
             answer = ask(localizer, frame)
             searches = localizer.context.searches(query_image, StageClock(), Deadline())
             for search in searches:
-                schedule.propose_first(search, None)
+                propose_first(search, None)
                 if answer["kind"] == "by nodes":
                     inliers[search.map.kind.name].append(search.num_retrieved)
             for search in searches:

@@ -8,7 +8,7 @@ instead (`map_query.py`), cheapest and likeliest first. Each one is verified in 
 (`search.py`): it is refined and its evidence counted. It then enters the belief over hypotheses
 (`belief.py`), until the result is settled. A pose is reported only if its evidence is strong and no
 other place explains the image as well. The checks of `checks.py` then change or refuse it. A map is
-an atlas of one tile. `schedule.py` chooses tiles, and `tiles/tiles.py` compares their poses.
+an atlas of one tile. `tiles/schedule.py` chooses tiles, and `tiles/tiles.py` compares their poses.
 
 These settings give the paper's own behaviour: `num_candidates=1`, `guided.num_nodes=0`,
 `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`.
@@ -34,8 +34,8 @@ from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.query import CameraLike, Deadline, QueryImage, StageClock, camera_of
 from topoloc.localization.result import Localization, NotLocalized, R, with_time
-from topoloc.localization.schedule import Schedule
 from topoloc.localization.search import Trace
+from topoloc.localization.tiles.schedule import Schedule
 from topoloc.localization.tiles.tiles import Reach, TileRanking, Tiles
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId

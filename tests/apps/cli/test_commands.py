@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from documented_json import EVIDENCE, POSE, PROVENANCE, SIGMAS, STAGES, read_lines, without_times
 
 from built_room import unseen_views
 from topoloc.apps.cli import main
@@ -16,38 +17,6 @@ from topoloc.apps.cli.queries.localize import Localizer
 from topoloc.geometry.alignment import translation_error
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.trajectory import Trajectory
-
-EVALUATION = {
-    "num_queries",
-    "num_localized",
-    "median_translation_m",
-    "median_rotation_deg",
-    "recall",
-    "topological_accuracy",
-}
-EVALUATION |= {"false_accepts", "median_times_ms", "map"}
-EVIDENCE = {"query", "localized", "candidates", "num_matches", "num_inliers", "times_ms"}
-PROVENANCE = {"map", "version", "t_ns", "camera", "features"}
-SIGMAS = {"position_sigma_m", "rotation_sigma_deg"}
-POSE = {"world_from_cam", "covariance", "probability", "node", "evidence", "noise_share"}
-STAGES = {"patch_normalization", "features", "coarse", "matching", "pnp", "total"}
-
-
-def _lines(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def _without_times(data: dict[str, Any]) -> dict[str, Any]:
-    kept = {
-        key: value
-        for key, value in data.items()
-        if key not in ("times_ms", "median_times_ms", "path")
-    }
-    return kept | {
-        name: [_without_times(part) for part in data[name]]
-        for name in ("recordings", "answers")
-        if name in data
-    }
 
 
 def test_build_and_info_agree_and_building_twice_gives_the_same_map(
@@ -145,7 +114,7 @@ def test_localize_writes_the_documented_json(
     )
     printed = capsys.readouterr()
     assert printed.err == ""
-    lines = _lines(results)
+    lines = read_lines(results)
     assert len(printed.out.splitlines()) == len(lines) == len(unseen_views())
     for number, line in enumerate(lines):
         assert set(line) == EVIDENCE | PROVENANCE | SIGMAS | POSE
@@ -165,7 +134,7 @@ def test_localize_writes_the_documented_json(
         assert translation_error(pose, truth) < 0.02
     assert main(["localize", str(room_map), str(queries), "--json", "-"]) == 0
     again = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [_without_times(line) for line in again] == [_without_times(line) for line in lines]
+    assert [without_times(line) for line in again] == [without_times(line) for line in lines]
 
 
 def test_single_photos_keep_their_order_in_the_trajectory(
@@ -189,7 +158,7 @@ def test_single_photos_keep_their_order_in_the_trajectory(
         )
         == 0
     )
-    assert [line["query"] for line in _lines(results)] == photos
+    assert [line["query"] for line in read_lines(results)] == photos
     found = Trajectory.read(trajectory)
     assert found.t_ns == [0, 1_000_000_000, 2_000_000_000]
     for pose, number in zip(found.world_from_cam, (4, 0, 2), strict=True):
@@ -215,7 +184,7 @@ def test_one_calibration_in_three_ways_gives_one_answer(
             )
             == 0
         )
-        answers.append(_without_times(json.loads(capsys.readouterr().out)))
+        answers.append(without_times(json.loads(capsys.readouterr().out)))
     assert answers[0]["localized"]
     assert answers[0] == answers[1] == answers[2]
 
@@ -243,7 +212,7 @@ def test_unreadable_pictures_are_results_and_fail_only_alone(
     assert capsys.readouterr().err.startswith(
         "warning: 2 of 3 images could not be read; the first: "
     )
-    lines = _lines(results)
+    lines = read_lines(results)
     assert [line.get("reason") for line in lines] == ["unreadable", "unreadable", None]
     assert "empty" in lines[0]["detail"]
     assert main(["localize", str(room_map), *broken, "--camera", "map"]) == 1
@@ -275,5 +244,5 @@ def test_an_interrupted_run_keeps_its_results(
         capsys.readouterr().err
         == f"error: interrupted (results of the 2 queries before: {results})\n"
     )
-    assert len(_lines(results)) == 2
+    assert len(read_lines(results)) == 2
     assert os.listdir(tmp_path) == ["results.jsonl"]

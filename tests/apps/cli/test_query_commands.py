@@ -12,43 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from documented_json import EVALUATION, EVIDENCE, PROVENANCE, read_lines, without_times
 
 from built_room import unseen_views
 from peak_memory import PEAK_KB
 from topoloc.apps.cli import main
 from topoloc.apps.cli.queries.localize import Localizer
-
-EVALUATION = {
-    "num_queries",
-    "num_localized",
-    "median_translation_m",
-    "median_rotation_deg",
-    "recall",
-    "topological_accuracy",
-}
-EVALUATION |= {"false_accepts", "median_times_ms", "map"}
-EVIDENCE = {"query", "localized", "candidates", "num_matches", "num_inliers", "times_ms"}
-PROVENANCE = {"map", "version", "t_ns", "camera", "features"}
-SIGMAS = {"position_sigma_m", "rotation_sigma_deg"}
-POSE = {"world_from_cam", "covariance", "probability", "node", "evidence", "noise_share"}
-STAGES = {"patch_normalization", "features", "coarse", "matching", "pnp", "total"}
-
-
-def _lines(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def _without_times(data: dict[str, Any]) -> dict[str, Any]:
-    kept = {
-        key: value
-        for key, value in data.items()
-        if key not in ("times_ms", "median_times_ms", "path")
-    }
-    return kept | {
-        name: [_without_times(part) for part in data[name]]
-        for name in ("recordings", "answers")
-        if name in data
-    }
 
 
 def test_evaluate_writes_the_documented_json(
@@ -81,7 +50,7 @@ def test_evaluate_writes_the_documented_json(
         len(unseen_views(1, 4.0)),
         0,
     )
-    assert _without_times(evaluations[0]) == _without_times(evaluations[1])
+    assert without_times(evaluations[0]) == without_times(evaluations[1])
     page = (tmp_path / "0.html").read_text()
     assert page.startswith("<!DOCTYPE html>")
     assert page.count("<article>") == 8
@@ -183,7 +152,7 @@ def test_a_query_may_be_given_a_time(
             == 0
         )
         assert all(
-            line["localized"] for line in _lines(tmp_path / "a.json")
+            line["localized"] for line in read_lines(tmp_path / "a.json")
         )  # the first hypothesis of each is clear
     assert given == [None, 0.0, 50.0, 80.0]
 
@@ -205,7 +174,7 @@ def test_a_query_without_a_pose_reports_the_time_limit(
         )
         == 0
     )
-    for line in _lines(tmp_path / "a.json"):
+    for line in read_lines(tmp_path / "a.json"):
         assert not line["localized"]
         assert "time was up" in line["detail"]
 

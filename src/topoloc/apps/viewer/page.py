@@ -158,7 +158,8 @@ def write_screenshot(page: Path, out: Path) -> None:
                 capture_output=True,
                 timeout=_TIMEOUT_S,
                 check=False,
-                env=os.environ | dict.fromkeys(_BROWSER_FOLDERS, profile),
+                cwd=profile,  # a long path of TMPDIR is too long for the browser's sockets
+                env=os.environ | dict.fromkeys(_BROWSER_FOLDERS, profile) | {"TMPDIR": "."},
             )
         except subprocess.TimeoutExpired:
             raise TopolocError(f"{browser} made no screenshot within {_TIMEOUT_S:g} s") from None
