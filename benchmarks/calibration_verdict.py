@@ -12,8 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from topoloc.geometry.calibration_check import CalibrationConsistency, check_calibration_consistency
-from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
+from topoloc.geometry.calibration_check import (
+    CalibrationConsistency,
+    IntrinsicsDeviation,
+    check_calibration_consistency,
+)
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.topomap import TopoMetricMap

@@ -11,9 +11,9 @@ import pytest
 from topoloc.geometry.calibration_check import (
     MIN_IMAGES,
     MIN_PLACES,
+    IntrinsicsDeviation,
     check_calibration_consistency,
 )
-from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 
 CAMERA = Camera.pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from topoloc.geometry.rolling_shutter import TurningCamera, find_rotation
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rolling_shutter import TurningCamera, find_rotation
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
 CAM_FROM_WORLD = Rigid3.exp(np.array([0.2, -0.1, 0.3, 0.1, -0.2, 0.05]))

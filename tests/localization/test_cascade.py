@@ -22,7 +22,7 @@ from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.features.features import Features
 from topoloc.features.learned import GridDescriptors, SingleLevelDescriptors
 from topoloc.geometry.alignment import translation_error
-from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
+from topoloc.geometry.calibration_check import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.image_calibration_check import check_image_calibration
 from topoloc.localization.localizer import Localizer, LocalizerConfig

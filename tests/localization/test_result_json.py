@@ -17,7 +17,7 @@ from built_room import built_room, unseen_views
 from schemas import SCHEMA, check_result
 from tiny_world import CAMERA, render, room
 from topoloc.errors import ResultError
-from topoloc.geometry.calibration_mismatch import CalibrationMismatch
+from topoloc.geometry.calibration_check import CalibrationMismatch
 from topoloc.geometry.geodesy import CAM_FROM_BODY, GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.localizer import Localizer

@@ -30,20 +30,17 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraHypothesis,
     CameraPrior,
     Vector,
-    map_variance,
     unchanged_camera,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     CameraObservations,
     fit_camera,
     fit_jointly,
-    weigh_cameras,
     weigh_poses,
 )
 from topoloc.geometry.pose_matches import (
     CAUCHY_SCALE,
     PoseMatches,
-    cells_of,
     is_non_collinear,
     refine_pose,
 )
@@ -139,20 +136,18 @@ def _choose_camera(
     """Return the pose and the camera of the likeliest hypothesis, starting from those of a first
     fit. The first fit itself is returned if its hypothesis is the likeliest."""
     first = uncalibrated.with_focal(camera.fx)
-    seen = CameraObservations(
-        first.normalized_from_img(finite[0]),
-        config.key_point_sigma_px / camera.fx,
-        finite[1],
-        finite[2],
-        cells_of(finite[0], camera.width, camera.height),
-        MAX_THRESHOLD_SCALE * config.max_reprojection_error_px / camera.fx,
+    seen = CameraObservations.from_pixels(
+        *finite,
+        first,
+        config.key_point_sigma_px,
+        max_error_px=MAX_THRESHOLD_SCALE * config.max_reprojection_error_px,
+        correlated_error_share=correlated_error_share,
     )
     prior = camera_prior(uncalibrated, camera.fx)
     fit = fit_camera(seen, cam_from_world, parameters_of(camera, first), prior)
     if fit is None:
         return None
-    fit = replace(fit, variance=fit.variance * map_variance(correlated_error_share))
-    weighed = weigh_cameras(fit.likelihood, prior)
+    weighed = prior.weigh(fit.likelihood)
     allowed = [hypothesis for hypothesis in weighed if hypothesis.lens != "other"]
     chosen = max(allowed, key=lambda hypothesis: weighed[hypothesis][0])
     if max(weighed, key=lambda hypothesis: weighed[hypothesis][0]).lens == "other":
@@ -178,7 +173,7 @@ def camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:
     is_narrow = high - low < 0.999 * math.log(usual.max_focal / usual.min_focal)
     stated = ((low + high) / 2.0, (high - low) / 4.0) if is_narrow else widest
     sides = uncalibrated.width / focal, uncalibrated.height / focal
-    return CameraPrior(sides, stated, widest)
+    return CameraPrior.of_unknown(sides, stated, widest)
 
 
 def parameters_of(camera: Camera, reference: Camera) -> Vector:

@@ -1,11 +1,4 @@
-"""Check a camera's calibration in one image and in many: estimate pose, focal length and principal
-point together from pixels of map points.
-
-A pose found with a wrong focal length or principal point absorbs part of the error, but the
-residuals stay systematic. So Gauss-Newton starts from this pose and estimates three more unknowns
-on the plane z = 1. Observations are `scale` times the projection plus `offset`. `scale` is the
-focal length relative to the calibrated one. `offset` is the shift of the principal point in
-calibrated focal lengths.
+"""Hold the deviation of an image's camera from its calibration, and combine those of many images.
 
 Many images together are more precise than one. Each image is weighted by its information. Images
 that disagree by more than their noise get smaller weights (Cauchy). Their scatter beyond the noise
@@ -24,159 +17,82 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.compiled import kernel
-from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import MODELS, Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import encode_json
+from topoloc.json_data import NonNegative, encode_json
 
-
-@kernel()
-def calibration_equations(
-    rotation, translation, free, observed, points_world, point_covariances, sigma, cauchy_scale
-):
-    """Return Gauss-Newton's normal equations for the pose's left perturbation (translation,
-    rotation) and for `free`: the logarithm of the scale, and the offset.
-
-    `observed` (n, 2) are coordinates on the plane z = 1, with standard deviation `sigma`. Each
-    point has Cauchy's weight 1 / (1 + s / c^2) of its squared Mahalanobis length s. Returns the
-    information (9, 9), the gradient (9) and the squared lengths (n).
-    """
-    information, gradient, squares = np.zeros((9, 9)), np.zeros(9), np.empty(len(observed))
-    jacobian, by_world, spread = np.zeros((2, 9)), np.zeros((2, 3)), np.zeros((2, 2))
-    scale = np.exp(free[0])
-    for i in range(len(observed)):
-        p = points_world[i]
-        x = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2] + translation[0]
-        y = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2] + translation[1]
-        z = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2] + translation[2]
-        u, v, w = x / z, y / z, 1.0 / z
-        jacobian[0, 0], jacobian[0, 2] = scale * w, -scale * u * w
-        jacobian[1, 1], jacobian[1, 2] = scale * w, -scale * v * w
-        jacobian[0, 3] = -scale * u * v
-        jacobian[0, 4] = scale * (1.0 + u * u)
-        jacobian[0, 5] = -scale * v
-        jacobian[1, 3] = -scale * (1.0 + v * v)
-        jacobian[1, 4] = scale * u * v
-        jacobian[1, 5] = scale * u
-        jacobian[0, 6], jacobian[0, 7] = scale * u, 1.0
-        jacobian[1, 6], jacobian[1, 8] = scale * v, 1.0
-        for a in range(2):
-            for k in range(3):
-                by_world[a, k] = (
-                    jacobian[a, 0] * rotation[0, k]
-                    + jacobian[a, 1] * rotation[1, k]
-                    + jacobian[a, 2] * rotation[2, k]
-                )
-        for a in range(2):
-            for b in range(2):
-                spread[a, b] = sigma**2 if a == b else 0.0
-                for j in range(3):
-                    for k in range(3):
-                        spread[a, b] += by_world[a, j] * point_covariances[i, j, k] * by_world[b, k]
-        determinant = spread[0, 0] * spread[1, 1] - spread[0, 1] * spread[1, 0]
-        i00 = spread[1, 1] / determinant
-        i01 = -spread[0, 1] / determinant
-        i11 = spread[0, 0] / determinant
-        e0, e1 = scale * u + free[1] - observed[i, 0], scale * v + free[2] - observed[i, 1]
-        squares[i] = e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
-        weight = 1.0 / (1.0 + squares[i] / cauchy_scale**2)
-        for a in range(9):
-            p0 = weight * (jacobian[0, a] * i00 + jacobian[1, a] * i01)
-            p1 = weight * (jacobian[0, a] * i01 + jacobian[1, a] * i11)
-            gradient[a] += p0 * e0 + p1 * e1
-            for b in range(9):
-                information[a, b] += p0 * jacobian[0, b] + p1 * jacobian[1, b]
-    return information, gradient, squares
-
-
-_NUM_ITERATIONS = 3
-_MAX_POINTS = 256  # evenly chosen among all: their noise is the smallest error
-_CAUCHY_SCALE = 2.3849
-# Standard deviation of the prior. Without it, a frontal view of a wall does not separate the focal
-# length from the distance.
-_PRIOR_SIGMA = 0.3
-_MIN_POINTS = 20
 MIN_IMAGES, MIN_PLACES = 5, 4  # images of one place share their errors, however many there are
 _NUM_SIGMAS, _MIN_RELATIVE_DEVIATION = 3.0, 0.02  # of the focal length, or of the image's width
 _NUM_MEAN_ITERATIONS = 10
+_CAUCHY_SCALE = 2.3849
 _MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
-class ImageCalibration:
-    """Hold the calibration estimated from one image.
+class IntrinsicsDeviation:
+    """Hold the deviation of an image's estimated intrinsics from the calibration, independent of
+    the image size.
 
     Args:
-        scale: focal length relative to the calibrated one.
-        offset: principal point relative to the calibrated one, in focal lengths (x, y).
-        covariance: covariance of the logarithm of the scale and of the offset.
-        cam_from_world: pose estimated together with them.
+        deviation: logarithm of the focal length over the calibrated one, and the shift of the
+            principal point in calibrated focal lengths (x, y).
+        covariance: its noise under independent errors of the points.
+        place: node that the image shows. Images of one node share the errors of its points.
+        is_distorted: whether the image shows distortion that the calibration leaves out.
     """
 
-    scale: float
-    offset: Float[np.ndarray, " 2"]
+    deviation: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "3 3"]
-    cam_from_world: Rigid3
+    place: int = -1
+    is_distorted: bool = False
 
 
-def estimate_image_calibration(
-    points_img: Float[np.ndarray, "n 2"],
-    points_world: Float[np.ndarray, "n 3"],
-    point_covariances: Float[np.ndarray, "n 3 3"],
-    camera: Camera,
-    cam_from_world: Rigid3,
-    sigma_px: float,
-) -> ImageCalibration | None:
-    """Estimate the calibration from n pixels of points (metres), starting from a pose found with
-    the given calibration. Return None if there are fewer than 20 points or the estimate fails."""
-    if len(points_img) < _MIN_POINTS:
-        return None
-    rows = np.unique(np.linspace(0, len(points_img) - 1, _MAX_POINTS).astype(int))
-    observed = camera.normalized_from_img(points_img[rows])
-    of_points = points_world[rows], point_covariances[rows], sigma_px / camera.fx, _CAUCHY_SCALE
-    pose, free = cam_from_world, np.zeros(3)  # logarithm of the scale, offset
-    information, squares = np.eye(9), np.zeros(len(rows))
-    for _ in range(_NUM_ITERATIONS):
-        rotation, translation = map(np.ascontiguousarray, (pose.rotation, pose.translation))
-        information, gradient, squares = calibration_equations(
-            rotation, translation, free, observed, *of_points
-        )
-        information[6:, 6:] += np.eye(3) / _PRIOR_SIGMA**2
-        gradient[6:] += free / _PRIOR_SIGMA**2
-        try:
-            step = -np.linalg.solve(information, gradient)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.isfinite(step).all() or abs(step[6]) > 1.0:
-            return None
-        pose, free = Rigid3.exp(step[:6]) @ pose, free + step[6:]
-    # A chi-square of two has its median at 2 ln 2.
-    noise = max(float(np.median(squares)) / (2.0 * math.log(2.0)), 0.05)
-    covariance = np.linalg.inv(information)[6:, 6:] * noise
-    return ImageCalibration(math.exp(free[0]), free[1:], covariance, pose)
+@dataclass(frozen=True, eq=False)
+class CalibrationMismatch:
+    """Compare the camera estimated from an image with the calibration, in pixels of the original
+    image.
+
+    `of` names the deviating parts: "focal_length", "principal_point", or "distortion", whose amount
+    is not measured. `shift` is the left
+    perturbation (metres, radians) from the pose under the calibration to the pose under the
+    estimated camera.
+    """
+
+    focal_length_px: NonNegative
+    focal_sigma_px: NonNegative
+    calibrated_focal_length_px: NonNegative
+    principal_point_px: Float[np.ndarray, " 2"]
+    calibrated_principal_point_px: Float[np.ndarray, " 2"]
+    of: list[str]
+    shift: Float[np.ndarray, " 6"]
+
+    def __str__(self) -> str:
+        parts = []
+        if "focal_length" in self.of:
+            measured = f"f = {self.focal_length_px:.0f} +- {max(self.focal_sigma_px, 0.5):.0f} px"
+            parts.append(f"{measured}, the calibration {self.calibrated_focal_length_px:.0f}")
+        if "principal_point" in self.of:
+            (x, y), (cx, cy) = self.principal_point_px, self.calibrated_principal_point_px
+            parts.append(
+                f"the principal point at ({x:.0f}, {y:.0f}), the calibration ({cx:.0f}, {cy:.0f})"
+            )
+        if "distortion" in self.of:
+            parts.append("that its lens distorts more than the calibration states")
+        return f"the picture says {'; '.join(parts)}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the mismatch as JSON, with a text for the user as `detail`."""
+        return encode_json(self) | {"detail": str(self)}
 
 
-def corrected_camera(camera: Camera, found: ImageCalibration) -> Camera:
-    """Return the camera with the estimated focal length and principal point. Its distortion is
-    unchanged."""
-    fx, fy = found.scale * camera.fx, found.scale * camera.fy
-    cx, cy = camera.cx + camera.fx * found.offset[0], camera.cy + camera.fy * found.offset[1]
-    moved = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+def corrected_camera(camera: Camera, deviation: Float[np.ndarray, " 3"]) -> Camera:
+    """Return the camera with another focal length and principal point (`IntrinsicsDeviation`). Its
+    distortion is unchanged."""
+    scale = math.exp(deviation[0])
+    cx, cy = np.array([camera.cx, camera.cy]) + camera.fx * deviation[1:]
+    moved = {"f": scale * camera.fx, "fx": scale * camera.fx, "fy": scale * camera.fy}
+    moved |= {"cx": cx, "cy": cy}
     named = zip(MODELS[camera.model], camera.params, strict=True)
     return replace(camera, params=tuple(float(moved.get(name, value)) for name, value in named))
-
-
-def compute_intrinsics_deviation(
-    calibrated: Camera, camera: Camera, found: ImageCalibration, place: int
-) -> IntrinsicsDeviation:
-    """Return the deviation of the estimate, found with `camera`, from the image's original
-    calibration. Both cameras must have one image size."""
-    estimated = corrected_camera(camera, found)
-    x = (estimated.cx - calibrated.cx) / calibrated.fx
-    y = (estimated.cy - calibrated.cy) / calibrated.fx
-    deviation = np.array([math.log(estimated.fx / calibrated.fx), x, y])
-    return IntrinsicsDeviation(deviation, found.covariance, place)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,53 +11,44 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.geometry.calibration_mismatch import CalibrationMismatch
+from topoloc.geometry.calibration_check import CalibrationMismatch
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
     WeighedCamera,
-    map_variance,
 )
-from topoloc.geometry.rolling_shutter import TurningCamera, find_rotation
 from topoloc.localization.answer import Answer, Finding, probability_within
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import compute_normalized_uncertainty
 from topoloc.localization.exact.appearance import check_colours
 from topoloc.localization.exact.last_step import look_again, refine_answer
-from topoloc.localization.image_calibration_check import check_image_calibration
+from topoloc.localization.image_calibration_check import TurningCamera, check_image_calibration
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.result import Localization
-from topoloc.localization.search import Search
 
 
 def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
     """Compare the image with its calibration, and with a camera that turned during the image.
 
     If the image contradicts its calibration, the covariance grows by the shift that the error
-    causes. The probability falls accordingly.
+    causes. The probability falls accordingly. If the camera turned, the pose is that of the middle
+    row.
     """
     search, best, pose = answer.search, answer.best, answer.pose
     if pose is None or best is None or best.fit.pose.camera is not None:
         return None
     with search.query.clock.stage("calibration"):
-        turning = _find_rotation(search, best)
-        is_evident = turning is not None and turning.is_evident
-        seen, doubt = (None, None) if is_evident else check_image_calibration(search, best.fit)
-        if not is_evident and doubt is None:
-            turning = None
-        # a rotation that is not evident is still likelier than a wrong calibration
-        if turning is not None:
-            best = _undo_rotation(best, turning)
-            seen, doubt = check_image_calibration(search, best.fit)
-    facts: dict[str, Any] = {"seen_camera": seen}
-    if doubt is not None:
-        return _doubt_camera(answer, pose, best, facts, doubt)
-    if turning is None:
+        found = check_image_calibration(search, best.fit, best.evidence.is_of_nodes)
+    facts: dict[str, Any] = {"seen_camera": found.seen}
+    if found.doubt is not None:
+        return _doubt_camera(answer, pose, best, facts, found.doubt)
+    if found.turning is None:
         return Finding("camera", "the image agrees with its calibration", facts=facts)
-    angle_deg = float(np.rad2deg(np.linalg.norm(turning.rotation)))
+    angle_deg = float(np.rad2deg(np.linalg.norm(found.turning.rotation)))
     text = f"the camera turned by {angle_deg:.2f} degrees during the image"
     facts["frame_rotation_deg"] = angle_deg
-    return Finding("camera", text, facts=facts, hypothesis=best)
+    undone = _undo_rotation(best, found.turning)
+    return Finding("camera", text, facts=facts, hypothesis=undone)
 
 
 def _doubt_camera(
@@ -85,31 +76,13 @@ def _doubt_camera(
     return Finding("camera", text, factor, facts, hypothesis=penalized)
 
 
-def _find_rotation(search: Search, best: Hypothesis) -> TurningCamera | None:
-    """Return the camera that turned while a rolling shutter read its rows, None if it may be at
-    rest."""
-    if not best.evidence.is_of_nodes:
-        return None
-    fit, seen = best.fit, best.fit.inlier_observations(1.0)
-    return find_rotation(
-        seen.points_img.astype(np.float64),
-        seen.points_world,
-        seen.covariances,
-        search.config.pose.key_point_sigma_px,
-        fit.camera,
-        fit.cam_from_world,
-        map_variance(search.correlated_error_share),
-    )
-
-
 def _undo_rotation(best: Hypothesis, turning: TurningCamera) -> Hypothesis:
-    """Return the hypothesis as if all rows had been read at once."""
+    """Return the hypothesis as if all rows had been read with the middle one."""
     fit = best.fit
-    points_img = turning.undo(fit.features.points_img.astype(np.float64), fit.camera)
-    features = replace(fit.features, points_img=points_img.astype(np.float32))
+    points_img = turning.undo(fit.features.points_img, fit.camera)
     covariance = fit.pose.covariance + turning.covariance
     pose = replace(fit.pose, cam_from_world=turning.cam_from_world, covariance=covariance)
-    fit = replace(fit, features=features, pose=pose)
+    fit = replace(fit, features=replace(fit.features, points_img=points_img), pose=pose)
     return replace(best, fit=fit, covariance=best.covariance + turning.covariance)
 
 

@@ -1,53 +1,79 @@
-"""Check the camera calibration against one image, and penalize the result if they contradict.
+"""Check the camera against one image: its calibration, and whether it turned while its rows were
+read.
 
-A wrong focal length or principal point gives a wrong pose with a small covariance. The residuals of
-the points show the error (`geometry/calibration_check.py`). If they do, the points are matched
-again around the corrected pose and camera until the estimate converges. The reported camera is then
-the image's own, not one halfway.
-
-The corrected camera must explain the image better than the calibration does. If the map itself is
-inaccurate, as in a bend that was seen from one lane only, another camera fits no better.
+A wrong calibration gives a wrong pose with a small covariance, and a camera that turned shears its
+image, but the residuals of the points show such errors. One linear step asks whether they do. If
+so, pose and camera are fitted together, and the likeliest hypothesis is believed
+(`geometry/joint_camera/`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass
 from itertools import compress
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from topoloc.geometry.calibration_check import (
     CalibrationConsistency,
-    ImageCalibration,
+    CalibrationMismatch,
+    IntrinsicsDeviation,
     check_calibration_consistency,
-    compute_intrinsics_deviation,
     corrected_camera,
-    estimate_image_calibration,
 )
-from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
+    CameraHypothesis,
     CameraPrior,
-    Vector,
-    map_variance,
     unchanged_camera,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     CameraObservations,
     JointFit,
+    estimate_intrinsics,
     fit_camera,
+    fit_jointly,
     linearized_fit,
-    weigh_cameras,
+    row_times,
 )
-from topoloc.geometry.pose_matches import cells_of
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided import match_guided
-from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
+from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
+
+_AS_CALIBRATED, _OTHER_INTRINSICS = CameraHypothesis(), CameraHypothesis(False, "xy")
+
+
+@dataclass(frozen=True, eq=False)
+class TurningCamera:
+    """Hold the pose of the middle row and the rotation (radians, camera axes) from the first to the
+    last row. `covariance` is what the rotation adds to that of the pose (left perturbation)."""
+
+    cam_from_world: Rigid3
+    rotation: Float[np.ndarray, " 3"]
+    covariance: Float[np.ndarray, "6 6"]
+
+    def undo(self, points_img: Float32[np.ndarray, "n 2"], camera: Camera) -> np.ndarray:
+        """Return where pixels would be if all rows were read with the middle one. Pixels without a
+        ray stay."""
+        points_img = points_img.astype(np.float64)
+        rays = np.insert(camera.normalized_from_img(points_img), 2, 1.0, axis=1)
+        times = row_times(points_img, camera.height)
+        moved = camera.img_from_cam(rays - times[:, None] * np.cross(self.rotation, rays))
+        return np.where(np.isfinite(moved), moved, points_img).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageCalibration:
+    """Hold what an image shows of its camera: the deviation from the calibration, the mismatch if
+    the image contradicts it, and the rotation if the camera turned."""
+
+    seen: IntrinsicsDeviation | None = None
+    doubt: CalibrationMismatch | None = None
+    turning: TurningCamera | None = None
 
 
 def check_camera_calibrations(
@@ -69,54 +95,80 @@ def check_camera_calibrations(
     return [verdict for verdict in verdicts if verdict is not None]
 
 
-def check_image_calibration(
-    search: Search, fit: PoseFit
-) -> tuple[IntrinsicsDeviation | None, CalibrationMismatch | None]:
-    """Estimate the camera from the inliers of a fit and compare it with the calibration.
+def check_image_calibration(search: Search, fit: PoseFit, may_turn: bool) -> ImageCalibration:
+    """Compare the inliers of a fit with the calibration, and with a camera that turned while a
+    rolling shutter read its rows, if it `may_turn`."""
+    settled, contradicted = 0.9, 0.1  # probabilities of the calibration
+    seen = _observe(search, fit)
+    first = seen and linearized_fit(seen, fit.cam_from_world, unchanged_camera())
+    if seen is None or first is None:
+        return ImageCalibration()
+    prior, joint = _prior(fit.camera, may_turn), None
+    if prior.weigh(first.likelihood)[_AS_CALIBRATED][0] < settled:
+        joint = fit_camera(seen, fit.cam_from_world, unchanged_camera(), prior)
+    other = joint and _refit(seen, joint, prior, _OTHER_INTRINSICS)
+    if joint is None or other is None:
+        return ImageCalibration(_deviation(first, fit))
+    deviation, weighed = _deviation(other, fit), prior.weigh(joint.likelihood)
+    if weighed.pop(_AS_CALIBRATED)[0] > contradicted and not _is_far(deviation, fit.camera):
+        return ImageCalibration(deviation)
+    best = max(weighed, key=lambda hypothesis: weighed[hypothesis][0])
+    is_distorted = best.lens != "none"
+    refined = _refit(seen, joint, prior, best) if is_distorted or best.is_turning else other
+    if refined is None:
+        return ImageCalibration(deviation)
+    deviation = _deviation(refined, fit, is_distorted)
+    if best.is_turning:
+        return ImageCalibration(deviation, turning=_turning(refined, prior, best))
+    return ImageCalibration(deviation, _mismatch(search, fit, best, refined, deviation))
 
-    Returns:
-        The deviation from the calibration, None if it cannot be estimated or there is no
-        calibration. The mismatch, None if the two agree.
-    """
-    suspect, reported = (3.0, 0.01), (5.0, 0.035)  # sigmas, share of focal length or image width
-    if isinstance(fit.input_camera, UncalibratedCamera):
-        return None, None
-    mismatch, found = _check_distortion(search, fit), _estimate_image_calibration(search, fit)
-    if found is None:
-        return None, mismatch
-    if mismatch is not None:
-        seen = compute_intrinsics_deviation(fit.camera, fit.camera, found, fit.node_id)
-        return replace(seen, is_distorted=True), mismatch
-    if not any(_is_calibration_off(fit, found, fit.camera, *suspect)):
-        return compute_intrinsics_deviation(fit.camera, fit.camera, found, fit.node_id), None
-    by_calibration, calibrated, first, place = fit, fit.camera, fit.cam_from_world, fit.node_id
-    fit, found = _refine_image_calibration(search, fit, found)
-    seen = compute_intrinsics_deviation(calibrated, fit.camera, found, place)
-    is_off = _is_calibration_off(fit, found, calibrated, *reported)
-    if not any(is_off) or not _is_better(_gain(by_calibration, fit)):
-        return seen, None
-    camera, scale = corrected_camera(fit.camera, found), search.query.scale
-    return seen, CalibrationMismatch(
-        camera.fx * scale,
-        math.sqrt(found.covariance[0, 0]) * camera.fx * scale,
-        calibrated.fx * scale,
-        _principal_point(camera, scale),
-        _principal_point(calibrated, scale),
-        list(compress(("focal_length", "principal_point"), is_off)),
-        (found.cam_from_world @ first.inverse()).log(),
-    )
+
+def _prior(camera: Camera, may_turn: bool) -> CameraPrior:
+    sides = camera.width / camera.fx, camera.height / camera.fy
+    return CameraPrior.of_calibration(sides, may_turn)
+
+
+def _refit(
+    seen: CameraObservations, joint: JointFit, prior: CameraPrior, hypothesis: CameraHypothesis
+) -> JointFit | None:
+    """Return the fit under a hypothesis, from one of all parameters."""
+    (mean, covariance), basis = prior.moments(hypothesis), hypothesis.basis
+    _, estimate, _ = prior.weigh(joint.likelihood)[hypothesis]
+    start = basis @ np.linalg.lstsq(basis, estimate, rcond=None)[0]
+    # errors of the points that the image does not show leave more to the prior
+    scaled = mean, covariance / joint.variance
+    return fit_jointly(seen, joint.cam_from_world, start, scaled, basis)
+
+
+def _turning(found: JointFit, prior: CameraPrior, hypothesis: CameraHypothesis) -> TurningCamera:
+    _, _, covariance = prior.weigh(found.likelihood)[hypothesis]
+    by_turn = found.pose_by_camera[:, 8:]
+    of_pose = by_turn @ covariance[8:, 8:] @ by_turn.T
+    return TurningCamera(found.cam_from_world, found.camera[8:], of_pose)
+
+
+def _is_far(seen: IntrinsicsDeviation, camera: Camera) -> bool:
+    """Return whether focal length or principal point deviate by more than their noise and by a
+    share of the focal length or image width that moves a pose."""
+    num_sigmas, share = 5.0, 0.035
+    scales = np.array([1.0, *np.repeat(camera.fx / camera.width, 2)])
+    deviation, sigmas = np.abs(seen.deviation), np.sqrt(np.diag(seen.covariance))
+    return bool(((deviation > num_sigmas * sigmas) & (scales * deviation > share)).any())
 
 
 def find_focal_doubt(search: Search, fit: PoseFit) -> str:
-    """Return a sentence if the points of a refused pose ask for another focal length, else "".
-
-    Too few agree to say which one. It is by one linear step, less than a millisecond."""
+    """Return a sentence if the points of a refused pose ask for another focal length, else "". Too
+    few agree to say which one."""
     num_sigmas, least = 3.0, 0.15  # logarithm; right calibrations of 108 refusals: up to 0.056
-    is_calibrated = not isinstance(fit.input_camera, UncalibratedCamera)
-    found = _estimate_image_calibration(search, fit) if is_calibrated else None
+    seen, free = _observe(search, fit), _OTHER_INTRINSICS
+    if seen is None:
+        return ""
+    moments = _prior(fit.camera, False).moments(free)
+    found = fit_jointly(seen, fit.cam_from_world, unchanged_camera(), moments, free.basis)
     if found is None:
         return ""
-    stretch, sigma = math.log(found.scale), math.sqrt(found.covariance[0, 0])
+    deviation, covariance = estimate_intrinsics(found)
+    stretch, sigma = deviation[0], math.sqrt(covariance[0, 0])
     if abs(stretch) < max(least, num_sigmas * sigma):
         return ""
     longer = "longer" if stretch > 0.0 else "shorter"
@@ -125,151 +177,49 @@ def find_focal_doubt(search: Search, fit: PoseFit) -> str:
     return f"or the calibration is wrong: {asked}"
 
 
-def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | None:
-    """Return the mismatch if the residuals show distortion that the calibration leaves out.
-
-    A linear estimate is enough where they show none. It gives distortion that is there a small
-    probability, but less than this threshold in none of 300 images through two lenses, and in 87 %
-    of 150 images without (`benchmarks/inputs.py`, six places).
-    """
-    seen, camera = fit.inlier_observations(1.0), fit.camera
-    seen = seen.select(np.unique(np.linspace(0, len(seen) - 1, 256).astype(int)))
-    points_img = seen.points_img.astype(np.float64)
-    observed = CameraObservations(
-        camera.normalized_from_img(points_img),
-        search.config.pose.key_point_sigma_px / camera.fx,
-        seen.points_world,
-        seen.covariances,
-        cells_of(points_img, camera.width, camera.height),
-        math.inf,
-    )
-    sides = camera.width / camera.fx, camera.height / camera.fy
-    calibrated = unchanged_camera()
-    # standard deviations of the logarithm of the focal length: calibrated or not
-    prior = CameraPrior(sides, stated=(0.0, 0.01), usual=(0.0, 0.3))
-    joint = linearized_fit(observed, fit.cam_from_world, calibrated)
-    if joint is None or _find_distortion(joint, prior, 0.012) is None:
+def _observe(search: Search, fit: PoseFit) -> CameraObservations | None:
+    """Return inliers of a calibrated image, None if they are too few."""
+    min_points, max_points = 20, 256
+    inliers = fit.inlier_observations(1.0)
+    if isinstance(fit.input_camera, UncalibratedCamera) or len(inliers) < min_points:
         return None
-    joint = fit_camera(observed, fit.cam_from_world, calibrated, prior)
-    if joint is not None:
-        shared = map_variance(search.correlated_error_share)
-        joint = replace(joint, variance=shared * joint.variance)
-    found = None if joint is None else _find_distortion(joint, prior, 0.99)
-    if joint is None or found is None:
-        return None
-    before_px, after_px = (
-        camera.fx * np.linalg.norm(observed.linearize(pose, parameters)[2], axis=1)
-        for pose, parameters in (
-            (fit.cam_from_world, calibrated),
-            (joint.cam_from_world, joint.camera),
-        )
+    return CameraObservations.from_pixels(
+        inliers.points_img,
+        inliers.points_world,
+        inliers.covariances,
+        fit.camera,
+        search.config.pose.key_point_sigma_px,
+        max_points=max_points,
+        correlated_error_share=search.correlated_error_share,
     )
-    if not _is_better(_gain_of(before_px, after_px, max(camera.width, camera.height))):
-        return None
-    scale = search.query.scale
-    focal, centre = camera.fx * scale, _principal_point(camera, scale)
-    # from the pose under the calibration to the pose under the estimated camera
-    cam_from_world = (
-        Rigid3.exp(joint.pose_by_camera @ (found - joint.camera)) @ joint.cam_from_world
+
+
+def _deviation(found: JointFit, fit: PoseFit, is_distorted: bool = False) -> IntrinsicsDeviation:
+    return IntrinsicsDeviation(*estimate_intrinsics(found), fit.node_id, is_distorted)
+
+
+def _mismatch(
+    search: Search,
+    fit: PoseFit,
+    best: CameraHypothesis,
+    refined: JointFit,
+    deviation: IntrinsicsDeviation,
+) -> CalibrationMismatch:
+    """Return the mismatch of the calibration with the likeliest hypothesis."""
+    calibrated, scale = fit.camera, search.query.scale
+    is_off = not best.is_focal_stated, bool(best.off_centre), best.lens != "none"
+    camera = calibrated  # the amount of distortion is not measured
+    if not is_off[2]:
+        camera = corrected_camera(calibrated, refined.camera[:3])
+    return CalibrationMismatch(
+        camera.fx * scale,
+        math.sqrt(deviation.covariance[0, 0]) * camera.fx * scale,
+        calibrated.fx * scale,
+        _principal_point(camera, scale),
+        _principal_point(calibrated, scale),
+        list(compress(("focal_length", "principal_point", "distortion"), is_off)),
+        (refined.cam_from_world @ fit.cam_from_world.inverse()).log(),
     )
-    shift = (cam_from_world @ fit.cam_from_world.inverse()).log()
-    return CalibrationMismatch(focal, 0.0, focal, centre, centre, ["distortion"], shift)
-
-
-def _find_distortion(joint: JointFit, prior: CameraPrior, min_probability: float) -> Vector | None:
-    """Return the likeliest camera parameters, None unless distortion is probable."""
-    weighed = weigh_cameras(joint.likelihood, prior)
-    if sum(weighed[one][0] for one in weighed if one.lens != "none") < min_probability:
-        return None
-    return max(weighed.values(), key=lambda one: one[0])[1]
-
-
-def _refine_image_calibration(
-    search: Search, fit: PoseFit, found: ImageCalibration
-) -> tuple[PoseFit, ImageCalibration]:
-    """Match the points again around the estimated camera until the estimate converges.
-
-    It does nothing if `guided.num_nodes` is 0.
-    """
-    num_rounds, converged_change = 4, 0.003
-    for _ in range(num_rounds if search.config.guided.num_nodes else 0):
-        around = _rematch(search, fit, found)
-        if not isinstance(around, PoseFit):
-            break
-        again = _estimate_image_calibration(search, around)
-        if again is None:  # no estimate: keep the previous one
-            break
-        fit, found = around, again
-        if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < converged_change:
-            break
-    return fit, found
-
-
-def _gain(before: PoseFit, after: PoseFit) -> float:
-    """Return `_gain_of` for the inliers of two fits."""
-    before_px, after_px = (
-        fit.inlier_observations(1.0).errors_px(fit.camera, fit.cam_from_world)
-        for fit in (before, after)
-    )
-    return _gain_of(before_px, after_px, max(before.camera.width, before.camera.height))
-
-
-def _is_better(gain: float) -> bool:
-    """Return whether an image's own camera explains it better than the calibration."""
-    return gain >= 3.0  # standard deviations
-
-
-def _gain_of(
-    before_px: Float[np.ndarray, " n"], after_px: Float[np.ndarray, " m"], side_px: int
-) -> float:
-    """Return the gain in points near their projections, in standard deviations of the counts.
-
-    It is summed over two radii. `side_px` is the longer side of the image.
-    """
-    radii_px = 1.0, 2.0  # in an image of 640 pixels
-    counts = [
-        [int(np.count_nonzero(errors < px * side_px / 640.0)) for errors in (before_px, after_px)]
-        for px in radii_px
-    ]
-    return sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts)
-
-
-def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibration | None:
-    seen = fit.inlier_observations(1.0)
-    points_img, sigma_px = seen.points_img.astype(np.float64), search.config.pose.key_point_sigma_px
-    found = estimate_image_calibration(
-        points_img, seen.points_world, seen.covariances, fit.camera, fit.cam_from_world, sigma_px
-    )
-    if found is None:
-        return None
-    return replace(found, covariance=map_variance(search.correlated_error_share) * found.covariance)
-
-
-def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PointMatches:
-    """Match the points again around the estimated pose and camera."""
-    camera, cam_from_world = corrected_camera(fit.camera, found), found.cam_from_world
-    config = search.config
-    rows = search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes)
-    local_map = search.map.local_map(rows)
-    matches = match_guided(fit.features, local_map, cam_from_world, camera, config.guided)
-    return fit_pose(fit.features, camera, local_map, matches, config.pose, (cam_from_world, camera))
-
-
-def _is_calibration_off(
-    fit: PoseFit, found: ImageCalibration, calibrated: Camera, num_sigmas: float, share: float
-) -> tuple[bool, bool]:
-    """Return whether the focal length and the principal point are off.
-
-    Both `num_sigmas` and `share` must be exceeded. `share` refers to the focal length and the image
-    width.
-    """
-    camera, sigmas = corrected_camera(fit.camera, found), np.sqrt(np.diag(found.covariance))
-    stretch = abs(math.log(camera.fx / calibrated.fx))
-    offset = np.abs(_principal_point(camera, 1.0) - _principal_point(calibrated, 1.0))
-    is_far = (offset > num_sigmas * sigmas[1:] * calibrated.fx) & (
-        offset > share * calibrated.width
-    )
-    return bool(stretch > num_sigmas * sigmas[0] and stretch > share), bool(is_far.any())
 
 
 def _principal_point(camera: Camera, scale: float) -> Float[np.ndarray, " 2"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from msgspec import Meta, Struct, structs
 
 from topoloc.errors import ResultError
-from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
+from topoloc.geometry.calibration_check import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.geodesy import GeoPose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Count, Finite, NonNegative, OneLine, decode_json

@@ -29,9 +29,8 @@ from topoloc.geometry.joint_camera.joint_fit import (
     JointFit,
     fit_camera,
     linearized_fit,
-    weigh_cameras,
 )
-from topoloc.geometry.pose_matches import CAUCHY_SCALE, cells_of
+from topoloc.geometry.pose_matches import CAUCHY_SCALE
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
@@ -185,16 +184,13 @@ class _CameraEstimate:
         )
 
     def _observations(self, inliers: PointObservations) -> CameraObservations:
-        rows = np.linspace(0, len(inliers) - 1, 256)  # their noise is the smallest error
-        seen = inliers.select(np.unique(rows.astype(int)))
-        points_img, camera = seen.points_img.astype(np.float64), self._reference
-        return CameraObservations(
-            camera.normalized_from_img(points_img),
-            self.localizer.config.pose.key_point_sigma_px / camera.fx,
-            seen.points_world,
-            seen.covariances,
-            cells_of(points_img, camera.width, camera.height),
-            math.inf,
+        return CameraObservations.from_pixels(
+            inliers.points_img,
+            inliers.points_world,
+            inliers.covariances,
+            self._reference,
+            self.localizer.config.pose.key_point_sigma_px,
+            max_points=256,
         )
 
     def _estimate(self) -> SharedCamera | None:
@@ -202,7 +198,7 @@ class _CameraEstimate:
         focal length remains uncertain."""
         max_focal_sigma = 0.01  # more moves a pose by several of its sigmas
         together = combine_likelihoods(self._seen, self._prior, len(self._viewpoints))
-        weighed = weigh_cameras(together, self._prior)
+        weighed = self._prior.weigh(together)
         chosen = max(weighed, key=lambda hypothesis: weighed[hypothesis][0])
         _, mean, covariance = weighed[chosen]
         if chosen.lens == "other" or math.sqrt(covariance[0, 0]) > max_focal_sigma:

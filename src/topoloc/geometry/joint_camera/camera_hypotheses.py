@@ -1,12 +1,12 @@
-"""Hold hypotheses about an uncalibrated camera: priors of eight parameters, and their
-probabilities. The parameters are those of `joint_camera/joint_fit.py`."""
+"""Hold hypotheses about a camera: priors of eleven parameters (`joint_fit.py`), and their
+probabilities."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -20,13 +20,13 @@ from topoloc.json_data import Positive, decode_json
 
 Lens = Literal["none", "radial", "other"]
 Axes = Literal["", "x", "y", "xy"]
-Vector = Float[np.ndarray, " 8"]
-Matrix = Float[np.ndarray, "8 8"]
+Vector = Float[np.ndarray, " 11"]
+Matrix = Float[np.ndarray, "11 11"]
 
 
 def unchanged_camera() -> Vector:
     """Return the parameters of the camera that others are compared with."""
-    return np.zeros(8)
+    return np.zeros(11)
 
 
 class _Priors(Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,6 +45,8 @@ class _Priors(Struct, frozen=True, forbid_unknown_fields=True):
     no_lens_sigma: Positive
     lens_sigma: Positive
     lens_quintic_sigma: Positive
+    turning: Positive
+    turning_sigma: Positive
     map_variance: Positive
 
 
@@ -68,27 +70,45 @@ class CameraHypothesis:
     is_focal_stated: bool = True
     off_centre: Axes = ""
     lens: Lens = "none"
+    is_turning: bool = False
 
     @property
     def log_prior(self) -> float:
         """Return the logarithm of the prior probability, but for a constant."""
         odds = _priors().lens[self.lens]
         odds *= _priors().off_centre[self.off_centre]
+        odds *= _priors().turning if self.is_turning else 1.0
         return math.log(odds if self.is_focal_stated else odds * _priors().unstated_focal)
 
     @property
-    def basis(self) -> Float[np.ndarray, "8 k"]:
+    def basis(self) -> Float[np.ndarray, "11 k"]:
         """Return the directions in which the parameters are estimated: always the principal point,
         because that of a whole image is off its centre by up to a per cent, too."""
-        eye = np.eye(8)
+        eye = np.eye(11)
         radial = np.column_stack([eye[:, 3:7].sum(axis=1), eye[:, 7]])
-        lens = {"none": eye[:, :0], "radial": radial, "other": eye[:, 3:]}[self.lens]
-        return np.hstack([eye[:, :3], lens])
+        turning = eye[:, 8:] if self.is_turning else eye[:, :0]
+        lens = {"none": eye[:, :0], "radial": radial, "other": eye[:, 3:8]}[self.lens]
+        return np.hstack([eye[:, :3], lens, turning])
+
+
+_DEVIATIONS = (
+    CameraHypothesis(),
+    CameraHypothesis(is_focal_stated=False),
+    CameraHypothesis(off_centre="x"),
+    CameraHypothesis(off_centre="y"),
+    CameraHypothesis(off_centre="xy"),
+    CameraHypothesis(is_focal_stated=False, off_centre="xy"),
+    CameraHypothesis(lens="radial"),
+    CameraHypothesis(lens="other"),
+    CameraHypothesis(is_turning=True),
+)
+_AT_REST_SIGMA = 1e-5  # rad
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """Hold the priors of the parameters. `sides` are width and height, in focal lengths.
+    """Hold the priors of the parameters and the hypotheses that they distinguish. `sides` are width
+    and height, in focal lengths.
 
     `stated` and `usual` are mean and standard deviation of the logarithm of the focal length, by
     its stated range and without it. They are equal if no range is stated.
@@ -97,6 +117,24 @@ class CameraPrior:
     sides: tuple[float, float]
     stated: tuple[float, float]
     usual: tuple[float, float]
+    hypotheses: tuple[CameraHypothesis, ...]
+
+    @staticmethod
+    def of_unknown(
+        sides: tuple[float, float], stated: tuple[float, float], usual: tuple[float, float]
+    ) -> CameraPrior:
+        """Return the prior of a camera without calibration: all combinations but a rotation."""
+        is_stated, odds = (True,) if stated == usual else (True, False), _priors()
+        every = product(is_stated, odds.off_centre, odds.lens)
+        return CameraPrior(sides, stated, usual, tuple(CameraHypothesis(*each) for each in every))
+
+    @staticmethod
+    @lru_cache(maxsize=64)
+    def of_calibration(sides: tuple[float, float], may_turn: bool) -> CameraPrior:
+        """Return the prior of a calibrated camera: one part of the calibration may be wrong, or the
+        camera may have turned while its rows were read."""
+        stated, usual = (0.0, 0.01), (0.0, 0.3)
+        return CameraPrior(sides, stated, usual, _DEVIATIONS if may_turn else _DEVIATIONS[:-1])
 
     def moments(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
         """Return mean and covariance of the parameters under a hypothesis."""
@@ -111,7 +149,8 @@ class CameraPrior:
         mean[0] = focal[0]
         is_lens = hypothesis.lens != "none"
         quintic = priors.lens_quintic_sigma if is_lens else priors.no_lens_sigma
-        sigmas = [focal[1], *offsets, *[priors.no_lens_sigma] * 4, quintic]
+        turning = priors.turning_sigma if hypothesis.is_turning else _AT_REST_SIGMA
+        sigmas = [focal[1], *offsets, *[priors.no_lens_sigma] * 4, quintic, *[turning] * 3]
         covariance = np.diag(np.square(sigmas))
         if is_lens:
             covariance[3:7, 3:7] += priors.lens_sigma**2
@@ -119,11 +158,20 @@ class CameraPrior:
             covariance[3:7, 3:7] += priors.lens_sigma**2 * np.eye(4)
         return mean, covariance
 
-    @property
-    def hypotheses(self) -> list[CameraHypothesis]:
-        """Return the hypotheses that differ."""
-        focal, odds = (True,) if self.stated == self.usual else (True, False), _priors()
-        return [CameraHypothesis(*values) for values in product(focal, odds.off_centre, odds.lens)]
+    @cached_property
+    def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        means, covariances = map(np.array, zip(*map(self.moments, self.hypotheses), strict=True))
+        return means, covariances, np.array([each.log_prior for each in self.hypotheses])
+
+    def weigh(self, seen: CameraLikelihood) -> dict[CameraHypothesis, tuple[float, Vector, Matrix]]:
+        """Return the probability of each hypothesis, and the parameters' mean and covariance under
+        it."""
+        means, covariances, log_priors = self._table
+        evidence, estimates, posteriors = seen.posteriors(means, covariances)
+        logs = evidence + log_priors
+        shares = np.exp(logs - logs.max())
+        found = zip((shares / shares.sum()).tolist(), estimates, posteriors, strict=True)
+        return dict(zip(self.hypotheses, found, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +183,8 @@ class CameraLikelihood:
     pull: Vector
 
     def posteriors(
-        self, means: Float[np.ndarray, "k 8"], covariances: Float[np.ndarray, "k 8 8"]
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 8"], Float[np.ndarray, "k 8 8"]]:
+        self, means: Float[np.ndarray, "k 11"], covariances: Float[np.ndarray, "k 11 11"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 11"], Float[np.ndarray, "k 11 11"]]:
         """Return the logarithm of the evidence of each of k priors, and the parameters' mean and
         covariance under it."""
         by_priors = np.linalg.inv(covariances)
@@ -145,7 +193,7 @@ class CameraLikelihood:
         pull = self.pull + weighed
         estimates = (posteriors @ pull[:, :, None])[:, :, 0]
         evidence = np.sum(pull * estimates, axis=1) - np.sum(means * weighed, axis=1)
-        evidence -= np.linalg.slogdet(np.eye(8) + covariances @ self.information)[1]
+        evidence -= np.linalg.slogdet(np.eye(11) + covariances @ self.information)[1]
         return 0.5 * evidence, estimates, posteriors
 
 
