@@ -22,9 +22,9 @@ from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.features.features import Features
 from topoloc.features.learned import GridDescriptors, SingleLevelDescriptors
 from topoloc.geometry.alignment import translation_error
-from topoloc.geometry.calibration_check import CalibrationMismatch, IntrinsicsDeviation
+from topoloc.geometry.calibration_check import CalibrationMismatch
 from topoloc.localization.belief import Hypothesis
-from topoloc.localization.image_calibration_check import check_image_calibration
+from topoloc.localization.image_calibration_check import ImageCalibration, check_image_calibration
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.pose_fit import PoseFit
@@ -156,14 +156,14 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_other_features(
 ):
     """Other features have too few matches for a contradiction, and the pose is equally wrong."""
 
-    def doubted(
-        search: Search, fit: PoseFit
-    ) -> tuple[IntrinsicsDeviation | None, CalibrationMismatch | None]:
-        seen, _ = check_image_calibration(search, fit)
+    def doubted(search: Search, fit: PoseFit, may_turn: bool) -> ImageCalibration:
+        seen = check_image_calibration(search, fit, may_turn).seen
         shift = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         doubt = CalibrationMismatch(200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), [part], shift)
         is_doubted = search.query.feature_config.kind == kind
-        return None if part == "distortion" else seen, doubt if is_doubted else None
+        return ImageCalibration(
+            None if part == "distortion" else seen, doubt if is_doubted else None
+        )
 
     monkeypatch.setattr("topoloc.localization.checks.check_image_calibration", doubted)
     monkeypatch.setattr(Search, "is_settled", property(lambda search: kind == "surf"))

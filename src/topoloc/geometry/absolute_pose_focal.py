@@ -35,7 +35,7 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
 from topoloc.geometry.joint_camera.joint_fit import (
     CameraObservations,
     fit_camera,
-    fit_jointly,
+    refit_camera,
     weigh_poses,
 )
 from topoloc.geometry.pose_matches import (
@@ -152,11 +152,7 @@ def _choose_camera(
     chosen = max(allowed, key=lambda hypothesis: weighed[hypothesis][0])
     if max(weighed, key=lambda hypothesis: weighed[hypothesis][0]).lens == "other":
         chosen = CameraHypothesis()
-    mean = chosen.basis @ np.linalg.lstsq(chosen.basis, weighed[chosen][1], rcond=None)[0]
-    pose = Rigid3.exp(fit.pose_by_camera @ (mean - fit.camera)) @ fit.cam_from_world
-    expected, covariance = prior.moments(chosen)
-    # errors of the points that the image does not show leave more to the prior
-    refit = fit_jointly(seen, pose, mean, (expected, covariance / fit.variance), chosen.basis)
+    refit = refit_camera(seen, fit, prior, chosen)
     if refit is None:
         return None
     belief = weigh_poses(fit, weighed, (chosen, refit.camera))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
@@ -37,6 +37,7 @@ from topoloc.geometry.joint_camera.joint_fit import (
     fit_camera,
     fit_jointly,
     linearized_fit,
+    refit_camera,
     row_times,
 )
 from topoloc.geometry.rigid import Rigid3
@@ -96,48 +97,63 @@ def check_camera_calibrations(
 
 
 def check_image_calibration(search: Search, fit: PoseFit, may_turn: bool) -> ImageCalibration:
-    """Compare the inliers of a fit with the calibration, and with a camera that turned while a
-    rolling shutter read its rows, if it `may_turn`."""
-    settled, contradicted = 0.9, 0.1  # probabilities of the calibration
+    """Compare the inliers of a fit with its calibration (`compare_with_calibration`)."""
     seen = _observe(search, fit)
-    first = seen and linearized_fit(seen, fit.cam_from_world, unchanged_camera())
-    if seen is None or first is None:
+    if seen is None:
         return ImageCalibration()
-    prior, joint = _prior(fit.camera, may_turn), None
+    found = compare_with_calibration(
+        seen, fit.camera, fit.cam_from_world, may_turn=may_turn, scale=search.query.scale
+    )
+    if found.seen is None:
+        return found
+    return replace(found, seen=replace(found.seen, place=fit.node_id))
+
+
+def compare_with_calibration(
+    seen: CameraObservations,
+    camera: Camera,
+    cam_from_world: Rigid3,
+    *,
+    may_turn: bool,
+    scale: float = 1.0,
+) -> ImageCalibration:
+    """Compare an image with its calibration, and with a camera that turned while a rolling shutter
+    read its rows, if it `may_turn`.
+
+    The pose was found with the calibration. The original image is `scale` times as wide.
+    """
+    settled, contradicted = 0.9, 0.1  # probabilities of the calibration
+    unchanged, joint = unchanged_camera(), None
+    first = linearized_fit(seen, cam_from_world, unchanged)
+    if first is None:
+        return ImageCalibration()
+    prior = _prior(camera, may_turn)
     if prior.weigh(first.likelihood)[_AS_CALIBRATED][0] < settled:
-        joint = fit_camera(seen, fit.cam_from_world, unchanged_camera(), prior)
-    other = joint and _refit(seen, joint, prior, _OTHER_INTRINSICS)
+        joint = fit_camera(seen, cam_from_world, unchanged, prior)
+    other = joint and refit_camera(seen, joint, prior, _OTHER_INTRINSICS)
     if joint is None or other is None:
-        return ImageCalibration(_deviation(first, fit))
-    deviation, weighed = _deviation(other, fit), prior.weigh(joint.likelihood)
-    if weighed.pop(_AS_CALIBRATED)[0] > contradicted and not _is_far(deviation, fit.camera):
+        return ImageCalibration(IntrinsicsDeviation(*estimate_intrinsics(first)))
+    deviation, weighed = (
+        IntrinsicsDeviation(*estimate_intrinsics(other)),
+        prior.weigh(joint.likelihood),
+    )
+    if weighed.pop(_AS_CALIBRATED)[0] > contradicted and not _is_far(deviation, camera):
         return ImageCalibration(deviation)
     best = max(weighed, key=lambda hypothesis: weighed[hypothesis][0])
-    is_distorted = best.lens != "none"
-    refined = _refit(seen, joint, prior, best) if is_distorted or best.is_turning else other
-    if refined is None:
-        return ImageCalibration(deviation)
-    deviation = _deviation(refined, fit, is_distorted)
+    if best.is_turning or best.lens != "none":
+        other = refit_camera(seen, joint, prior, best) or other
+        deviation = IntrinsicsDeviation(
+            *estimate_intrinsics(other), is_distorted=not best.is_turning
+        )
     if best.is_turning:
-        return ImageCalibration(deviation, turning=_turning(refined, prior, best))
-    return ImageCalibration(deviation, _mismatch(search, fit, best, refined, deviation))
+        return ImageCalibration(deviation, turning=_turning(other, prior, best))
+    shift = (other.cam_from_world @ cam_from_world.inverse()).log()
+    return ImageCalibration(deviation, _mismatch(camera, best, deviation, shift, scale))
 
 
 def _prior(camera: Camera, may_turn: bool) -> CameraPrior:
     sides = camera.width / camera.fx, camera.height / camera.fy
     return CameraPrior.of_calibration(sides, may_turn)
-
-
-def _refit(
-    seen: CameraObservations, joint: JointFit, prior: CameraPrior, hypothesis: CameraHypothesis
-) -> JointFit | None:
-    """Return the fit under a hypothesis, from one of all parameters."""
-    (mean, covariance), basis = prior.moments(hypothesis), hypothesis.basis
-    _, estimate, _ = prior.weigh(joint.likelihood)[hypothesis]
-    start = basis @ np.linalg.lstsq(basis, estimate, rcond=None)[0]
-    # errors of the points that the image does not show leave more to the prior
-    scaled = mean, covariance / joint.variance
-    return fit_jointly(seen, joint.cam_from_world, start, scaled, basis)
 
 
 def _turning(found: JointFit, prior: CameraPrior, hypothesis: CameraHypothesis) -> TurningCamera:
@@ -194,31 +210,25 @@ def _observe(search: Search, fit: PoseFit) -> CameraObservations | None:
     )
 
 
-def _deviation(found: JointFit, fit: PoseFit, is_distorted: bool = False) -> IntrinsicsDeviation:
-    return IntrinsicsDeviation(*estimate_intrinsics(found), fit.node_id, is_distorted)
-
-
 def _mismatch(
-    search: Search,
-    fit: PoseFit,
+    calibrated: Camera,
     best: CameraHypothesis,
-    refined: JointFit,
-    deviation: IntrinsicsDeviation,
+    seen: IntrinsicsDeviation,
+    shift: Float[np.ndarray, " 6"],
+    scale: float,
 ) -> CalibrationMismatch:
     """Return the mismatch of the calibration with the likeliest hypothesis."""
-    calibrated, scale = fit.camera, search.query.scale
     is_off = not best.is_focal_stated, bool(best.off_centre), best.lens != "none"
-    camera = calibrated  # the amount of distortion is not measured
-    if not is_off[2]:
-        camera = corrected_camera(calibrated, refined.camera[:3])
+    # the amount of distortion is not measured
+    camera = calibrated if is_off[2] else corrected_camera(calibrated, seen.deviation)
     return CalibrationMismatch(
         camera.fx * scale,
-        math.sqrt(deviation.covariance[0, 0]) * camera.fx * scale,
+        math.sqrt(seen.covariance[0, 0]) * camera.fx * scale,
         calibrated.fx * scale,
         _principal_point(camera, scale),
         _principal_point(calibrated, scale),
         list(compress(("focal_length", "principal_point", "distortion"), is_off)),
-        (refined.cam_from_world @ fit.cam_from_world.inverse()).log(),
+        shift,
     )
 
 

@@ -159,7 +159,7 @@ class CameraObservations:
         *,
         max_error_px: float = math.inf,
         max_points: int | None = None,
-        correlated_error_share: float | None = None,
+        correlated_error_share: float = 0.0,
     ) -> CameraObservations:
         """Create observations of a first camera. Of more than `max_points`, some are chosen evenly:
         their noise is the smallest error."""
@@ -174,7 +174,7 @@ class CameraObservations:
             cells_of(points_img, camera.width, camera.height),
             row_times(points_img, camera.height),
             max_error_px / camera.fx,
-            1.0 if correlated_error_share is None else map_variance(correlated_error_share),
+            map_variance(correlated_error_share),
         )
 
     def linearize(
@@ -313,6 +313,18 @@ def fit_camera(
             return None
         cam_from_world, camera = fit.cam_from_world, fit.camera
     return fit
+
+
+def refit_camera(
+    seen: CameraObservations, fit: JointFit, prior: CameraPrior, hypothesis: CameraHypothesis
+) -> JointFit | None:
+    """Return the fit under one hypothesis, from one of all parameters."""
+    (expected, covariance), basis = prior.moments(hypothesis), hypothesis.basis
+    _, estimate, _ = prior.weigh(fit.likelihood)[hypothesis]
+    camera = basis @ np.linalg.lstsq(basis, estimate, rcond=None)[0]
+    pose = Rigid3.exp(fit.pose_by_camera @ (camera - fit.camera)) @ fit.cam_from_world
+    # errors of the points that the image does not show leave more to the prior
+    return fit_jointly(seen, pose, camera, (expected, covariance / fit.variance), basis)
 
 
 def linearized_fit(
