@@ -111,7 +111,7 @@ class MapContext:
 
     def without(self, node_ids: Iterable[NodeId]) -> MapContext:
         """Return the map without these nodes. See `Localizer.without`."""
-        rows = [self.topomap.row_of(node_id) for node_id in node_ids]
+        rows = self.topomap.rows_of(node_ids)
         types = tuple(replace(one, map=one.map.without(rows)) for one in self.types)
         return replace(self, types=types)
 

@@ -104,7 +104,7 @@ class OpenMap:
 
     def cam_from_world(self, row: Row) -> Rigid3:
         """Return cam_from_world of a node."""
-        return self.topomap.summaries[row].world_from_cam.inverse()
+        return self.node_poses.world_from_node(row).inverse()
 
     def local_map(self, rows: Sequence[Row]) -> LocalMap:
         """Return the points of these nodes, pooled."""
@@ -114,9 +114,9 @@ class OpenMap:
         """Return the descriptors of a node's points."""
         return self._local_map(row).descriptors
 
-    def template(self, node_id: NodeId) -> NodeTemplate:
-        """Return the image of a node."""
-        return self._template(self.topomap.row_of(node_id))
+    def templates(self, node_ids: Iterable[NodeId]) -> list[NodeTemplate]:
+        """Return the images of these nodes."""
+        return self._template.pool(self.topomap.rows_of(node_ids))
 
     def predict_at_node(self, row: Row, camera: Camera) -> Float32[np.ndarray, "n 5"]:
         """Return `predict_key_points` of a node's points for a camera at the node's pose.
@@ -175,7 +175,7 @@ class OpenMap:
         for _ in range(6):
             if not left:
                 return
-            near = self.distances(self.topomap.summaries[left[0]].world_from_cam) <= radius
+            near = self.distances(self.node_poses.world_from_node(left[0])) <= radius
             yield [row for row in left if near[row]][:3]
             left = [row for row in left if not near[row]]
 

@@ -26,7 +26,7 @@ from topoloc.localization.guided import match_guided
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.search import Proposal, Search
-from topoloc.node_ids import NodeId, Row
+from topoloc.node_ids import Row
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def _refit_with_own_nodes(search: Search, first: PoseFit) -> PointMatches:
         first.local_map.node_ids[first.inlier_point_idx], return_counts=True
     )
     most = node_ids[np.argsort(-counts, kind="stable")[: config.num_nodes]]
-    rows = [search.map.topomap.row_of(NodeId(int(one))) for one in most]
+    rows = search.map.topomap.rows_of(most)
     return fit_around(search, first.cam_from_world, first.camera, config.radius_px, rows=rows)
 
 

@@ -6,11 +6,14 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+from jaxtyping import Int
+
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.exact.patch_alignment import NodeTemplate
+from topoloc.localization.exact.patch_alignment import PointTemplates
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PointMatches, PoseFit
@@ -173,12 +176,14 @@ class Search:
         is_open = any(best is not None and best.probability >= least for best in found)
         return not is_open and self.num_retrieved < self.weights.stop.min_inliers
 
-    def template(self, node_id: NodeId) -> NodeTemplate:
-        """Return the image of a node. The trace collects the nodes without a usable one."""
-        template = self.map.template(node_id)
-        if template.is_black and self.trace is not None:
-            self.trace.nodes_without_image.add(node_id)
-        return template
+    def templates(self, node_of_point: Int[np.ndarray, " n"]) -> PointTemplates:
+        """Return the images of the nodes of points. The trace collects nodes without one."""
+        node_ids, of_point = np.unique(node_of_point, return_inverse=True)
+        templates = self.map.templates(node_ids.tolist())
+        if self.trace is not None:
+            pairs = zip(node_ids.tolist(), templates, strict=True)
+            self.trace.nodes_without_image.update(one for one, image in pairs if image.is_black)
+        return PointTemplates(templates, of_point)
 
     def add(self, hypothesis: Hypothesis | None) -> None:
         """Add a hypothesis to the belief, unless it is None."""

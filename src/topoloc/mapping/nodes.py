@@ -63,6 +63,10 @@ class NodePoses:
             np.array([p.rotation for p in world_from_nodes]).reshape(-1, 3, 3),
         )
 
+    def world_from_node(self, row: int) -> Rigid3:
+        """Return the pose of a node."""
+        return Rigid3(self.rotations[row], self.centres[row])
+
     def rows(self, rows: Sequence[int] | Int[np.ndarray, " some"]) -> NodePoses:
         """Return the poses of some nodes."""
         return NodePoses(self.centres[rows], self.rotations[rows])

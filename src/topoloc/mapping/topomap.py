@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import html
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, no_type_check
+from typing import TYPE_CHECKING, Any, ClassVar, SupportsInt, no_type_check
 
 import numpy as np
 
@@ -203,6 +203,10 @@ class TopoMetricMap:
     def row_of(self, node_id: NodeId) -> Row:
         """Return the row of a node. Raises KeyError if the map has no node with this id."""
         return self._rows[node_id]
+
+    def rows_of(self, node_ids: Iterable[SupportsInt]) -> list[Row]:
+        """Return the rows of nodes, such as an array of ids. Raises KeyError as `row_of` does."""
+        return [self._rows[NodeId(int(node_id))] for node_id in node_ids]
 
     @property
     def rows(self) -> list[Row]:

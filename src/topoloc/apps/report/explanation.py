@@ -87,9 +87,8 @@ def explain(
     result = localizer.localize(image, camera, max_ms=deadline, trace=trace)
     poses = [_evaluate_pose(tried, result) for tried in trace.tried]
     near = {pose.tried.fit.node_id for pose in poses if pose.num_inliers and pose.node_id >= 0}
-    without = trace.nodes_without_image | {
-        node_id for node_id in near if localizer.context.first.map.template(node_id).is_black
-    }
+    templates = zip(near, localizer.context.first.map.templates(near), strict=True)
+    without = trace.nodes_without_image | {one for one, image in templates if image.is_black}
     num_features = {pose.tried.features: len(pose.tried.fit.features) for pose in poses}
     lights = {
         f"{session.session_id} ({session.name})": session.light

@@ -26,7 +26,6 @@ from topoloc.localization.guided import select_visible_points
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search
-from topoloc.node_ids import NodeId
 
 
 class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -89,14 +88,14 @@ class ColourAgreement:
 
 def compare_colours(search: Search, found: Localization) -> ColourAgreement | None:
     """Compare the colours of the points in view. None: an image is grey, or few points are."""
-    weights, query, topomap = load_appearance_weights(), search.query, search.map.topomap
+    weights, query, opened = load_appearance_weights(), search.query, search.map
     # an uncalibrated camera is estimated with the pose
     camera, in_query = found.provenance.camera or query.camera, small_colours(query.image)
     if in_query is None:
         return None
     # the nodes near a pose beside a bend look past its walls; those of its inliers do not
-    seen_from = topomap.summaries[topomap.row_of(found.node_id)].world_from_cam
-    points = search.map.local_map(search.map.nearest(seen_from, weights.num_nodes))
+    seen_from = opened.node_poses.world_from_node(opened.topomap.row_of(found.node_id))
+    points = opened.local_map(opened.nearest(seen_from, weights.num_nodes))
     cam_from_world = found.world_from_cam.inverse()
     rows, pixels = select_visible_points(points, cam_from_world, camera)
     places = pixels / [camera.width, camera.height]
@@ -106,13 +105,8 @@ def compare_colours(search: Search, found: Localization) -> ColourAgreement | No
         return None
     sampled = shown[sample_rows(len(shown))]
     positions, node_ids = points.points_world[rows[sampled]], points.node_ids[rows[sampled]]
-    of_query, of_map = sample_colours(in_query, places[sampled]), np.full((len(sampled), 3), np.nan)
-    for node_id in np.unique(node_ids):
-        node, of_node = search.template(NodeId(int(node_id))), node_ids == node_id
-        if node.colours is not None:
-            at = node.camera.img_from_cam(node.world_from_cam.inverse().apply(positions[of_node]))
-            size = [node.camera.width, node.camera.height]
-            of_map[of_node] = sample_colours(node.colours, at / size)
+    of_query = sample_colours(in_query, places[sampled])
+    of_map = search.templates(node_ids).sample_colours(positions)
     known = np.isfinite(of_map[:, 0])
     if np.count_nonzero(known) < weights.min_points:
         return None

@@ -163,12 +163,13 @@ def refine_precisely(
         return None
     inliers = fit.matches.select(np.flatnonzero(fit.pose.inliers))
     chosen, aligned = spread(inliers, around.camera, weights.max_aligned), fit
+    templates = searches[0].templates(chosen.node_ids)
     for reach_px in weights.reaches_px:
         moved = align(
             searches[0].query.grey,
             around.camera,
             chosen,
-            searches[0].template,
+            templates,
             aligned.pose.cam_from_world,
             reach_px,
             weights,

@@ -6,7 +6,7 @@ query image. This is adaptive least-squares correlation (Gruen, 1985) with a shi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -19,12 +19,11 @@ from msgspec import Struct
 from topoloc.compiled import parallel_for_rows
 from topoloc.errors import FeatureTypeError, MapError
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3, positions_of
+from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.mapping.topomap import TopoNode
-from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image, to_grey
 
 
@@ -173,11 +172,53 @@ def sample_colours(
     return sampled.reshape(-1, 3).astype(np.float64)
 
 
+@dataclass(frozen=True, eq=False)
+class PointTemplates:
+    """Hold the images of the nodes of points: that of point k is `templates[of_point[k]]`."""
+
+    templates: Sequence[NodeTemplate]
+    of_point: Int[np.ndarray, " n"]
+
+    @property
+    def rotations(self) -> Float[np.ndarray, "n 3 3"]:
+        """Return the rotation of world_from_cam of the node of each point."""
+        return np.array([one.world_from_cam.rotation for one in self.templates])[self.of_point]
+
+    @property
+    def origins(self) -> Float[np.ndarray, "n 3"]:
+        """Return the position (metres, world) of the node of each point."""
+        return np.array([one.world_from_cam.translation for one in self.templates])[self.of_point]
+
+    def in_nodes(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return points in the camera frames of their nodes, metres."""
+        return np.einsum("nji,nj->ni", self.rotations, points_world - self.origins)
+
+    def project(self, in_nodes: Float[np.ndarray, "k n 3"]) -> Float[np.ndarray, "k n 2"]:
+        """Return the pixels of k positions of each point, given in the frame of its node."""
+        pixels, cameras = np.empty((*in_nodes.shape[:2], 2)), [one.camera for one in self.templates]
+        for camera in set(cameras):
+            rows = np.flatnonzero(np.array([one == camera for one in cameras])[self.of_point])
+            projected = camera.img_from_cam(in_nodes[:, rows].reshape(-1, 3))
+            pixels[:, rows] = projected.reshape(-1, len(rows), 2)
+        return pixels
+
+    def sample_colours(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the `small_colours` of points in the images of their nodes, NaN where grey."""
+        pixels = self.project(self.in_nodes(points_world)[None])[0]
+        colours = np.full(points_world.shape, np.nan)
+        for k, template in enumerate(self.templates):
+            rows = np.flatnonzero(self.of_point == k)
+            if template.colours is not None:
+                size = [template.camera.width, template.camera.height]
+                colours[rows] = sample_colours(template.colours, pixels[rows] / size)
+        return colours
+
+
 def align(
     image: UInt8[np.ndarray, "h w"],
     camera: Camera,
     matches: PreciseMatches,
-    read_template: Callable[[NodeId], NodeTemplate],
+    templates: PointTemplates,
     cam_from_world: Rigid3,
     reach_px: int,
     weights: LastStepWeights,
@@ -185,28 +226,24 @@ def align(
     """Align matches by correlation with the nodes' images. Matches that do not correlate are
     dropped. Of the error of a point, that along the ray of its node remains: its pixel in the
     node's image is where the patch was taken."""
-    node_ids, node_of_match = np.unique(matches.node_ids, return_inverse=True)
-    templates = [read_template(NodeId(int(node_id))) for node_id in node_ids]
-    sizes = np.array([template.image.shape for template in templates]).reshape(-1, 2)
-    images = np.zeros((len(templates), *sizes.max(axis=0, initial=1)), np.uint8)
-    for k, template in enumerate(templates):
+    sizes = np.array([one.image.shape for one in templates.templates]).reshape(-1, 2)
+    images = np.zeros((len(sizes), *sizes.max(axis=0, initial=1)), np.uint8)
+    for k, template in enumerate(templates.templates):
         images[k, : sizes[k, 0], : sizes[k, 1]] = template.image
-    predicted, centres, warps = _compute_warps(
-        matches, cam_from_world, camera, templates, node_of_match
-    )
-    pixels, correlations = np.empty((len(matches), 2)), np.empty(len(matches))
+    points_world = matches.points_world
+    predicted, centres, warps = _compute_warps(points_world, cam_from_world, camera, templates)
+    pixels, correlations = np.empty_like(predicted), np.empty(len(predicted))
 
     def align_band(first: int, last: int) -> None:
         band = slice(first, last)
-        projected = node_of_match[band], predicted[band], centres[band], warps[band]
+        projected = templates.of_point[band], predicted[band], centres[band], warps[band]
         numbers = weights.patch_px, reach_px, weights.min_patch_sigma
         pixels[band], correlations[band] = align_patches(image, images, sizes, *projected, *numbers)
 
-    parallel_for_rows(align_band, len(matches))
+    parallel_for_rows(align_band, len(predicted))
     rows = np.flatnonzero(correlations > weights.correlations[0])
     sigmas = np.interp(correlations[rows], weights.correlations, weights.aligned_sigmas_px)
-    found, poses = matches.select(rows), [template.world_from_cam for template in templates]
-    rays = found.points_world - positions_of(poses)[node_of_match[rows]]
+    found, rays = matches.select(rows), points_world[rows] - templates.origins[rows]
     along = np.einsum("ni,nj,nk,nl,nkl->nij", rays, rays, rays, rays, found.covariances)
     along /= np.square(np.sum(rays**2, axis=1))[:, None, None]
     return replace(
@@ -215,31 +252,21 @@ def align(
 
 
 def _compute_warps(
-    matches: PreciseMatches,
+    points_world: Float[np.ndarray, "n 3"],
     cam_from_world: Rigid3,
     camera: Camera,
-    templates: Sequence[NodeTemplate],
-    node_of_match: Int[np.ndarray, " n"],
+    templates: PointTemplates,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
     """Return the pixel of each point in the query and in the node's image, and the derivative of
     the second by the first on a plane that faces the node."""
-    rotations = np.array([one.world_from_cam.rotation for one in templates])[node_of_match]
-    origins = np.array([one.world_from_cam.translation for one in templates])[node_of_match]
-    in_query = cam_from_world.apply(matches.points_world)
-    in_node = np.einsum("nji,nj->ni", rotations, matches.points_world - origins)
-    step = 0.01 * in_node[:, 2:]  # short enough for the derivative of any lens
-    axes = np.einsum("ij,njk->kni", cam_from_world.rotation, rotations)[:2]
-    predicted = camera.img_from_cam(in_query)
-    by_query = [camera.img_from_cam(in_query + step * axis) - predicted for axis in axes]
-    centres, by_node = np.empty_like(predicted), np.empty((2, *predicted.shape))
-    cameras = [template.camera for template in templates]
-    for node_camera in set(cameras):
-        rows = np.flatnonzero(np.array([one == node_camera for one in cameras])[node_of_match])
-        centres[rows] = node_camera.img_from_cam(in_node[rows])
-        for k in range(2):
-            moved = in_node[rows] + step[rows] * np.eye(3)[k]
-            by_node[k, rows] = node_camera.img_from_cam(moved) - centres[rows]
-    (a, c), (b, d) = (one.T for one in by_query)
+    in_query, in_node = cam_from_world.apply(points_world), templates.in_nodes(points_world)
+    # short enough for the derivative of any lens
+    steps = 0.01 * in_node[:, 2:] * np.eye(3)[:2, None]
+    turned = np.einsum("ij,njk,lnk->lni", cam_from_world.rotation, templates.rotations, steps)
+    queried = np.stack([in_query, *(in_query + turned)])
+    predicted, *by_query = camera.img_from_cam(queried.reshape(-1, 3)).reshape(3, -1, 2)
+    centres, *by_node = templates.project(np.stack([in_node, *(in_node + steps)]))
+    (a, c), (b, d) = ((moved - predicted).T for moved in by_query)
     with np.errstate(divide="ignore", invalid="ignore"):  # a plane seen from its edge
         inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
-    return predicted, centres, np.einsum("jni,jkn->nik", by_node, inverse)
+    return predicted, centres, np.einsum("jni,jkn->nik", by_node - centres, inverse)

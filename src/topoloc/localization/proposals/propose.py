@@ -154,7 +154,7 @@ def propose_similar_places(search: Search) -> Iterator[NodeProposal]:
         left = [row for row in left if far[row]]
     num_groups = 0
     while left and num_groups < config.max_groups:
-        leader = Rigid3(nodes.rotations[left[0]], nodes.centres[left[0]])
+        leader = nodes.world_from_node(left[0])
         near = node_distances(leader, nodes, search.map.lambda_rot) <= reach
         group, left = [row for row in left if near[row]], [row for row in left if not near[row]]
         if set(group) != queried:
