@@ -103,10 +103,8 @@ def node_distances(
     world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float
 ) -> Float[np.ndarray, " nodes"]:
     """Return D_total of Eq. 1 (metres) between a camera and each node."""
-    d_translation = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
     traces = np.einsum("nij,ij->n", nodes.rotations, world_from_cam.rotation)
-    d_rot = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
-    return d_translation + lambda_rot * d_rot
+    return _total_distances(world_from_cam, nodes, traces, lambda_rot)
 
 
 def node_distances_for_any_roll(
@@ -117,9 +115,20 @@ def node_distances_for_any_roll(
     It is the minimum over four rolls, 90 degrees apart.
     """
     x, y, z = world_from_cam.rotation.T
-    rolls = (np.column_stack(axes) for axes in ((x, y, z), (y, -x, z), (-x, -y, z), (-y, x, z)))
-    poses = (Rigid3(roll, world_from_cam.translation) for roll in rolls)
-    return np.min([node_distances(pose, nodes, lambda_rot) for pose in poses], axis=0)
+    rolls = np.stack([(x, y, z), (y, -x, z), (-x, -y, z), (-y, x, z)])
+    traces = np.einsum("nij,rji->rn", nodes.rotations, rolls).max(axis=0)
+    return _total_distances(world_from_cam, nodes, traces, lambda_rot)
+
+
+def _total_distances(
+    world_from_cam: Rigid3,
+    nodes: NodePoses,
+    traces: Float[np.ndarray, " nodes"],
+    lambda_rot: float,
+) -> Float[np.ndarray, " nodes"]:
+    """Return D_total of Eq. 1 (metres) from the traces of the rotations between camera and node."""
+    d_translation = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
+    return d_translation + lambda_rot * np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
 
 
 def select_node_frames(
