@@ -110,9 +110,9 @@ class OpenMap:
         """Return the points of these nodes, pooled."""
         return LocalMap.concatenate(self._local_map.pool(rows))
 
-    def descriptors(self, row: Row) -> Float32[np.ndarray, "n d"]:
-        """Return the descriptors of a node's points."""
-        return self._local_map(row).descriptors
+    def descriptors(self, rows: Sequence[Row]) -> list[Float32[np.ndarray, "n d"]]:
+        """Return the descriptors of the points of each of these nodes."""
+        return [one.descriptors for one in self._local_map.pool(rows)]
 
     def templates(self, node_ids: Iterable[NodeId]) -> list[NodeTemplate]:
         """Return the images of these nodes."""
@@ -211,7 +211,8 @@ class OpenMap:
     def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> list[Row]:
         """Return the rows of the nodes nearest to a camera, nearest first."""
         order = np.argsort(self.distances(world_from_cam), kind="stable")
-        return as_rows(order[: min(num_nodes, len(self.node_ids) - len(self._masked_rows))])
+        num_nodes = min(num_nodes, len(self.node_ids) - len(self._masked_rows))
+        return [Row(row) for row in order[:num_nodes].tolist()]
 
 
 class _MaskedCoarseLocalizer:

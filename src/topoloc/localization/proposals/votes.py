@@ -68,13 +68,14 @@ def count_votes(
     num_features = 64
     query = search.query
     ranked = search.map.coarse.rank(query.image, query.features, max_nodes)
-    points = {one.row: search.map.descriptors(one.row) for one in ranked}
-    rows = [row for row, of_node in points.items() if len(of_node)]
+    rows = list(dict.fromkeys(one.row for one in ranked))
+    descriptors = dict(zip(rows, search.map.descriptors(rows), strict=True))
+    rows = [row for row in rows if len(descriptors[row])]
     if not rows or not len(query.features):
         return [], np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     apart = _distances_between(search, rows)
     strongest = query.features.descriptors[:num_features]
-    similarities = largest_similarities(strongest, [points[row] for row in rows])
+    similarities = largest_similarities(strongest, [descriptors[row] for row in rows])
     nearest, largest = similarities.argmax(axis=0), similarities.max(axis=0)
     elsewhere = np.where(apart[:, nearest] > 2.0, similarities, -1.0).max(axis=0)
     # where no node is elsewhere, a feature leads over none
