@@ -15,7 +15,6 @@ from msgspec import structs
 from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
 from topoloc.localization.answer import lead
 from topoloc.localization.belief import (
-    Belief,
     Hypothesis,
     is_same_fit,
     log_odds_margin,
@@ -163,7 +162,7 @@ def test_chains_of_near_poses_are_split_equally_in_any_order(
     """The middle pose equals both ends, and the ends differ."""
     chain = [made_hypothesis(3.0, x=0.0), made_hypothesis(2.0, x=0.4), made_hypothesis(1.0, x=0.8)]
     belief = believed([chain[k] for k in order]).belief
-    assert [one.log_odds for one in belief.ranked(WEIGHTS.rivals)] == [3.0, 1.0]
+    assert [one.log_odds for one in belief.hypotheses] == [3.0, 1.0]
 
 
 def test_alone_a_hypothesis_is_as_probable_as_its_odds_against_nowhere():
@@ -364,7 +363,7 @@ def test_without_a_hypothesis_there_is_none_to_name():
         CANDIDATES,
         (),
     )
-    assert Belief().best(WEIGHTS.rivals) is None
+    assert believed([]).best is None
 
 
 def test_a_stopped_search_is_reported():

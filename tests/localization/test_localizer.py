@@ -259,7 +259,7 @@ def test_the_trace_contains_all_proposals_and_explains_the_result(
             assert tried.hypothesis.source == tried.source
             assert tried.hypothesis.fit is tried.refined
             belief = belief.with_hypothesis(tried.hypothesis, evidence, weights)
-    best = belief.best(weights)
+    best = belief.hypotheses[0] if belief.hypotheses else None
     if isinstance(result, Localization):
         assert best is not None
         np.testing.assert_array_equal(result.world_from_cam.matrix(), best.world_from_cam.matrix())

@@ -7,7 +7,7 @@ reason for a refusal. Each check of `checks.py` returns a `Finding`. `Answer.aft
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -125,7 +125,7 @@ class Answer:
 def lead(search: Search) -> Answer:
     """Return the answer that follows from the belief of a search."""
     rivals, min_probability = search.weights.rivals, search.config.evidence.min_probability
-    ranked = search.belief.ranked(rivals)
+    ranked = search.belief.hypotheses
     if not ranked or ranked[0].probability < min_probability:
         best = ranked[0] if ranked else None
         return Answer(search, best, _explain_not_localized(search, best), [])
@@ -233,7 +233,7 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     return replace(best, covariance=total, noise_share=float(share))
 
 
-def _ambiguous_answer(search: Search, ranked: list[Hypothesis], shares: list[float]) -> Answer:
+def _ambiguous_answer(search: Search, ranked: Sequence[Hypothesis], shares: list[float]) -> Answer:
     """Return an ambiguous answer with the probability of each alternative."""
     best, probable = ranked[0], select_probable(ranked, shares)
     named = [_build_localization(search, one, share) for one, share in probable]

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -77,7 +78,7 @@ class Hypothesis:
         """Return the pose."""
         return self.fit.world_from_cam
 
-    @property
+    @cached_property
     def probability(self) -> float:
         """Return the probability of this pose if "not in the map" is the only alternative."""
         return self.evidence.precision_probability / (1.0 + math.exp(-self.log_odds))
@@ -110,7 +111,7 @@ def select_probable(found: Sequence[T], shares: Sequence[float]) -> list[tuple[T
 
 
 def _log_odds_margins(
-    hypotheses: tuple[Hypothesis, ...], weights: RivalWeights
+    hypotheses: Sequence[Hypothesis], weights: RivalWeights
 ) -> Float[np.ndarray, "n n"]:
     """Compute the log-odds margin of each hypothesis (row) over each (column).
 
@@ -152,6 +153,9 @@ def _share_points(a: PoseFit, b: PoseFit) -> bool:
 class Belief:
     """Hold the hypotheses so far, the strongest one of each pose.
 
+    They are sorted by their least margin over the others. Those with a probability of at least 0.5
+    come first.
+
     `all_hypotheses` holds every hypothesis added, because "the same pose" is not transitive. The
     middle one of three may equal both ends, which differ from each other. The selection is
     therefore repeated for each new hypothesis, from the strongest down. The result does not depend
@@ -180,7 +184,8 @@ class Belief:
         for k in (places[id(one)] for one in _rank_hypotheses(all_hypotheses, weights)):
             if not any(min(k, other) in same_pose[max(k, other)] for other in kept):
                 kept.append(k)
-        return Belief(tuple(all_hypotheses[k] for k in kept), all_hypotheses, same_pose)
+        distinct = _rank_hypotheses([all_hypotheses[k] for k in kept], weights)
+        return Belief(tuple(distinct), all_hypotheses, same_pose)
 
     @property
     def of_nodes(self) -> list[Hypothesis]:
@@ -190,22 +195,12 @@ class Belief:
         """
         return [one for one in self.hypotheses if one.evidence.is_of_nodes]
 
-    def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
-        """Return the hypotheses, sorted by their least margin over the others.
 
-        Those with a probability of at least 0.5 come first.
-        """
-        return _rank_hypotheses(self.hypotheses, weights)
-
-    def best(self, weights: RivalWeights) -> Hypothesis | None:
-        """Return the likeliest hypothesis, even if its probability is low. None if there is
-        none."""
-        return self.ranked(weights)[0] if self.hypotheses else None
-
-
-def _rank_hypotheses(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[Hypothesis]:
+def _rank_hypotheses(
+    hypotheses: Sequence[Hypothesis], weights: RivalWeights
+) -> Sequence[Hypothesis]:
     if len(hypotheses) < 2:
-        return list(hypotheses)
+        return hypotheses
     log_odds_margins = _log_odds_margins(hypotheses, weights)
     np.fill_diagonal(log_odds_margins, np.inf)
     least = {

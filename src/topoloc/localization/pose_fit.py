@@ -129,7 +129,7 @@ class PointMatches:
         """Return the number of inliers."""
         return len(self.inlier_query_idx)
 
-    @property
+    @cached_property
     def node_id(self) -> NodeId:
         """Return the node with the most inliers, -1 if there are no inliers."""
         node_ids, counts = np.unique(
@@ -164,7 +164,7 @@ class PoseFit(PointMatches):
         """Return the pose."""
         return self.cam_from_world.inverse()
 
-    @property
+    @cached_property
     def median_depth(self) -> float:
         """Return the median depth of the inliers, metres."""
         points_world = self.local_map.points_world[self.inlier_point_idx]

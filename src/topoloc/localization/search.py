@@ -143,7 +143,7 @@ class Search:
     @property
     def best(self) -> Hypothesis | None:
         """Return the likeliest hypothesis so far, even if its probability is low."""
-        return self.belief.best(self.weights.rivals)
+        return self.belief.hypotheses[0] if self.belief.hypotheses else None
 
     @property
     def is_clear(self) -> bool:
@@ -160,7 +160,7 @@ class Search:
         """
         if not self.is_clear:
             return False
-        best, *others = self.belief.ranked(self.weights.rivals)
+        best, *others = self.belief.hypotheses
         return all(
             log_odds_margin(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds
             for other in others

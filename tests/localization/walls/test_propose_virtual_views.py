@@ -243,7 +243,7 @@ def _by_the_walls(
     search = _search(topomap, picture, config)
     for proposal in propose_virtual_views(search):
         search.add(verify(proposal))
-    return search.belief.ranked(search.weights.rivals)
+    return list(search.belief.hypotheses)
 
 
 def _search(

@@ -102,7 +102,7 @@ def look_again(query: MapQuery, answer: Answer) -> Finding | None:
     belief = Belief()
     for one in [*(one for one, _ in crowded), *others]:
         belief = belief.with_hypothesis(one, search.config.evidence, search.weights.rivals)
-    if belief.best(search.weights.rivals) is not best:
+    if belief.hypotheses[0] is not best:
         return None
     reconsidered = lead(replace(search, belief=belief))
     text = "the matches of all nodes crowd around their predictions"

@@ -239,7 +239,7 @@ def propose_from_other_features(search: Search) -> Iterator[NodeProposal]:
     config, previous = search.config, search.previous
     if previous is None or search.is_clear or config.guided.num_nodes == 0:
         return
-    for hypothesis in previous.belief.ranked(previous.weights.rivals)[:3]:
+    for hypothesis in previous.belief.hypotheses[:3]:
         fit, least = hypothesis.fit, float(config.evidence.min_found)
         yield from _propose_around(search, "other features", fit.world_from_cam, fit.camera, least)
 
