@@ -21,41 +21,15 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Struct
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Finite
 from topoloc.localization.config import EvidenceConfig
+from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.pose_fit import PoseFit
-from topoloc.localization.provenance import Evidence, log_doubt, log_even_share
+from topoloc.localization.provenance import Evidence
 
 _CHI_SQUARE_6_AT_95 = 12.592
 MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
-
-
-class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the weights that compare two poses of one image.
-
-    They weigh the log-odds, the spatially uniform inlier ratio and the normalized uncertainty, in
-    logarithms. `lead` is the minimum log-odds margin of a reported pose over each other one,
-    `unclear_lead` that of a pose that is not clear over each pose elsewhere.
-    """
-
-    odds: Finite
-    even_share: Finite
-    doubt: Finite
-    unclear_lead: Finite
-    lead: Finite = 2.0
-
-    def score(self, evidence: Evidence, log_odds: float) -> float:
-        """Return the score of a pose. The difference of two scores is a log-odds margin.
-
-        It is NaN for virtual views, whose evidence is of another kind.
-        """
-        if not evidence.is_of_nodes:
-            return math.nan
-        even_share, doubt = log_even_share(evidence), log_doubt(evidence)
-        return self.odds * log_odds + self.even_share * even_share + self.doubt * doubt
 
 
 @dataclass(frozen=True, eq=False)

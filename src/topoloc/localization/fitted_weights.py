@@ -23,12 +23,21 @@ from msgspec.structs import astuple
 from topoloc.errors import FeatureTypeError
 from topoloc.features.feature_types import FEATURE_TYPES, LEARNED_TYPES
 from topoloc.json_data import Finite, decode_json
-from topoloc.localization.belief import RivalWeights
-from topoloc.localization.provenance import Evidence, log_doubt, log_even_share
+from topoloc.localization.provenance import Evidence
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FALLBACK_TYPE, LEARNED_FALLBACK_TYPE = "surf", LEARNED_TYPES[0].name
 """Feature types whose weights are the fallback: for types without a network, and with one."""
+
+
+def _log_even_share(evidence: Evidence) -> float:
+    """Return the logarithm of the spatially uniform inlier ratio, which is finite for 0, too."""
+    return math.log(evidence.even_share + 0.002)
+
+
+def _log_doubt(evidence: Evidence) -> float:
+    """Return the logarithm of the normalized uncertainty, which is finite for 0, too."""
+    return math.log(max(evidence.doubt, 0.01))
 
 
 class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -74,12 +83,12 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
         """Return the inputs of the regression."""
         e = evidence
         return (
-            log_even_share(e),
+            _log_even_share(e),
             math.log((e.num_found + 1) / (e.num_by_chance + 5)),
             math.log(e.num_inliers + 1),
             math.log((e.num_inliers + 1) / (e.num_matches + 10)),
             math.log(e.spread + 0.02),
-            log_doubt(e),
+            _log_doubt(e),
         )
 
     def is_clear(self, log_odds: float) -> bool:
@@ -150,8 +159,8 @@ class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
             math.log(e.spread + 0.02),
             math.log((e.num_distinct or 0) + 1),
             math.log((e.num_lesser_side or 0) + 2),
-            log_even_share(e),
-            log_doubt(e),
+            _log_even_share(e),
+            _log_doubt(e),
         )
 
     def is_clear(self, log_odds: float) -> bool:
@@ -164,9 +173,34 @@ def compute_log_odds(evidence: Evidence, weights: EvidenceWeights | VirtualViewW
     features = weights.features(evidence)
     log_odds = sum(w * x for w, x in zip(weights.as_vector, features, strict=True)) + weights.bias
     if isinstance(weights, EvidenceWeights) and evidence.spread < weights.narrow_spread:
-        by_doubt = weights.narrow_doubt * (log_doubt(evidence) - math.log(0.1))
+        by_doubt = weights.narrow_doubt * (_log_doubt(evidence) - math.log(0.1))
         return min(log_odds, weights.max_narrow_log_odds + by_doubt)
     return log_odds
+
+
+class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the weights that compare two poses of one image.
+
+    They weigh the log-odds, the spatially uniform inlier ratio and the normalized uncertainty, in
+    logarithms. `lead` is the minimum log-odds margin of a reported pose over each other one,
+    `unclear_lead` that of a pose that is not clear over each pose elsewhere.
+    """
+
+    odds: Finite
+    even_share: Finite
+    doubt: Finite
+    unclear_lead: Finite
+    lead: Finite = 2.0
+
+    def score(self, evidence: Evidence, log_odds: float) -> float:
+        """Return the score of a pose. The difference of two scores is a log-odds margin.
+
+        It is NaN for virtual views, whose evidence is of another kind.
+        """
+        if not evidence.is_of_nodes:
+            return math.nan
+        even_share, doubt = _log_even_share(evidence), _log_doubt(evidence)
+        return self.odds * log_odds + self.even_share * even_share + self.doubt * doubt
 
 
 class ConfirmationWeights(Struct, frozen=True, forbid_unknown_fields=True):

@@ -70,16 +70,6 @@ def probability_within_tolerance(doubt: float) -> float:
     return math.erf(1.0 / (math.sqrt(2.0) * doubt))
 
 
-def log_even_share(evidence: Evidence) -> float:
-    """Return the logarithm of the spatially uniform inlier ratio, which is finite for 0, too."""
-    return math.log(evidence.even_share + 0.002)
-
-
-def log_doubt(evidence: Evidence) -> float:
-    """Return the logarithm of the normalized uncertainty, which is finite for 0, too."""
-    return math.log(max(evidence.doubt, 0.01))
-
-
 @dataclass(frozen=True, repr=False)
 class Provenance(OneLine):
     """Hold the source of a result. Unknown values are None or empty.

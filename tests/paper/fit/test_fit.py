@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from msgspec import json, structs
 
-from topoloc.localization.belief import RivalWeights
 from topoloc.localization.fitted_weights import (
     CorrelatedErrorWeights,
     EvidenceWeights,
     FittedWeights,
     NodeStop,
+    RivalWeights,
     compute_log_odds,
     load_fitted_weights,
     read_weights,

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float
 from msgspec import structs
 from scipy.optimize import minimize
 
-from topoloc.localization.belief import RivalWeights
-from topoloc.localization.fitted_weights import EvidenceWeights, compute_log_odds
+from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, compute_log_odds
 from topoloc_paper.fit.tried_poses import TriedPose
 
 MIN_HARD_PAIRS = 80
