@@ -99,9 +99,9 @@ class MapQuery:
 
 
 def verify_all(search: Search, proposals: Iterable[Proposal]) -> None:
-    """Add the verified proposals to the belief of their search, until the deadline."""
+    """Verify proposals of a search, until the deadline."""
     for proposal in proposals:
-        search.add(verify(proposal))
+        verify(proposal)
         if search.query.deadline.is_past:
             search.is_stopped = True
             return

@@ -185,19 +185,11 @@ class Search:
             self.trace.nodes_without_image.update(one for one, image in pairs if image.is_black)
         return PointTemplates(templates, of_point)
 
-    def add(self, hypothesis: Hypothesis | None) -> None:
-        """Add a hypothesis to the belief, unless it is None."""
-        if hypothesis is not None:
-            self.belief = self.belief.with_hypothesis(
-                hypothesis, self.config.evidence, self.weights.rivals
-            )
 
+def verify(proposal: Proposal) -> None:
+    """Refine a proposal, score it, and add the hypothesis to the belief of its search.
 
-def verify(proposal: Proposal) -> Hypothesis | None:
-    """Refine a proposal and score it.
-
-    Returns:
-        The hypothesis. None if too few points were found, or the pose was found already.
+    There is none if too few points were found, or the pose was found already.
     """
     search, final = proposal.search, proposal.refine()
     hypothesis = None if final is None else proposal.score(final)
@@ -209,4 +201,7 @@ def verify(proposal: Proposal) -> Hypothesis | None:
         search.trace.tried.append(
             TriedProposal(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind)
         )
-    return hypothesis
+    if hypothesis is not None:
+        search.belief = search.belief.with_hypothesis(
+            hypothesis, search.config.evidence, search.weights.rivals
+        )

@@ -17,7 +17,7 @@ from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization import map_query
-from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.belief import Belief
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
@@ -266,9 +266,9 @@ def test_a_wrong_prior_does_not_localize_an_out_of_map_image(room: TopoMetricMap
 def test_a_repeated_pose_is_not_tried_again(room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
     followed = list[Proposal]()
 
-    def follow(proposal: Proposal) -> Hypothesis | None:
+    def follow(proposal: Proposal) -> None:
         followed.append(proposal)
-        return verify(proposal)
+        verify(proposal)
 
     monkeypatch.setattr(map_query, "verify", follow)
     for picture, _ in unseen_views():

@@ -242,7 +242,7 @@ def _by_the_walls(
     """Return the hypotheses of virtual views alone, the likeliest first."""
     search = _search(topomap, picture, config)
     for proposal in propose_virtual_views(search):
-        search.add(verify(proposal))
+        verify(proposal)
     return list(search.belief.hypotheses)
 
 
@@ -314,7 +314,7 @@ def test_places_with_far_fewer_matches_are_skipped_beside_a_clear_pose(
     walls = structs.replace(search.weights.walls, stop=stop)
     search.weights = replace(search.weights, walls=walls)
     for proposal in propose_virtual_views(search):
-        search.add(verify(proposal))
+        verify(proposal)
     assert search.is_clear
     assert search.map.walls is not None
     assert len(VirtualViewSearch.of(search, search.map.walls).places) > 1
