@@ -25,7 +25,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.guided import count_chance_matches, select_visible_points
-from topoloc.localization.map_facts.repetition import fold_repetitions, shifted_copies
+from topoloc.localization.map_facts.repetition import fold_repetitions
 from topoloc.localization.pose_fit import PointMatches, PoseFit
 from topoloc.localization.provenance import Evidence, probability_within_tolerance
 from topoloc.localization.search import Search
@@ -212,7 +212,7 @@ def _count_found_points(
     perturbation of cam_from_world.
     """
     dense, agreeing_img, points = final.features.dense, None, final.local_map
-    visible, visible_img = select_visible_points(points, final.cam_from_world, final.camera)
+    visible, visible_img = select_visible_points(points, final.pose.cam_from_world, final.camera)
     num_visible = len(visible_img)
     if dense is not None and num_visible > 0:
         sampled = sample_rows(num_visible)  # more points do not change the ratio
@@ -225,7 +225,7 @@ def _count_found_points(
 
 def _with_chance_matches(search: Search, evidence: Evidence, final: PoseFit) -> Evidence:
     """Return the evidence with the number of matches that a wrong pose would give."""
-    around = final.local_map, final.cam_from_world, final.camera
+    around = final.local_map, final.pose.cam_from_world, final.camera
     num_by_chance = count_chance_matches(final.features, *around, search.config.guided)
     return replace(evidence, num_by_chance=num_by_chance)
 
@@ -245,7 +245,7 @@ def _with_unguided(
     agreement_px = 4.0 * math.sqrt(1.0 + search.correlated_error_share)
     num_agreeing = _count_agreeing_matches(
         unguided,
-        final.cam_from_world,
+        final.pose.cam_from_world,
         final.camera,
         agreement_px,
         _repetition_shifts(search, final),
@@ -280,17 +280,14 @@ def _count_agreeing_matches(
     shifts: Float[np.ndarray, "k 3"],
 ) -> int:
     """Count the matches that agree with a pose, by their point or one of its copies."""
-    is_near = np.zeros(len(unguided.matches), bool)
-    for points_world in shifted_copies(
-        unguided.local_map.points_world[unguided.matches.train_idx], shifts
-    ):
-        with np.errstate(invalid="ignore"):
-            offsets = (
-                camera.img_from_cam(cam_from_world.apply(points_world))
-                - unguided.features.points_img[unguided.matches.query_idx]
-            )
-            is_near |= np.linalg.norm(offsets, axis=1) < agreement_px * camera.radius_scale
-    return int(np.count_nonzero(is_near))
+    points_world = unguided.local_map.points_world[unguided.matches.train_idx]
+    copies = np.vstack([np.zeros(3), shifts])[:, None] + points_world
+    with np.errstate(invalid="ignore"):
+        pixels = camera.img_from_cam(cam_from_world.apply(copies.reshape(-1, 3)))
+        offsets = pixels.reshape(*copies.shape[:2], 2)
+        offsets -= unguided.features.points_img[unguided.matches.query_idx]
+        is_near = np.linalg.norm(offsets, axis=2) < agreement_px * camera.radius_scale
+    return int(np.count_nonzero(is_near.any(axis=0)))
 
 
 def _repetition_shifts(search: Search, final: PoseFit) -> Float[np.ndarray, "k 3"]:

@@ -20,7 +20,6 @@ from topoloc.localization.map_facts.map_building import with_repetitions
 from topoloc.localization.map_facts.repetition import (
     find_repetition_shifts,
     fold_repetitions,
-    shifted_copies,
 )
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import LocalMap
@@ -94,12 +93,6 @@ def test_folded_points_of_all_panels_are_the_points_of_one():
     points_world = fold_repetitions(_wall(4).points_world, np.array([PERIOD, -PERIOD, 2 * PERIOD]))
     spread = points_world.reshape(4, len(PANEL), 3) - points_world[: len(PANEL)]
     np.testing.assert_allclose(spread, 0.0, atol=1e-9)
-
-
-def test_copies_are_the_points_and_each_shift_of_them():
-    np.testing.assert_allclose(
-        shifted_copies(PANEL, PERIOD[None])[1] - PANEL, np.tile(PERIOD, (len(PANEL), 1))
-    )
 
 
 # moves across the whole map

@@ -162,10 +162,3 @@ def fold_repetitions(
     gap = int(np.argmax(np.diff(fractions, append=fractions[:1] + 1.0))) if len(fractions) else 0
     cut = fractions[gap] + 1e-6 if len(fractions) else 0.0
     return points_world - np.floor(along - cut)[:, None] * shift
-
-
-def shifted_copies(
-    points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]
-) -> Float[np.ndarray, "c n 3"]:
-    """Return the points themselves, and moved by each shift."""
-    return np.stack([points_world, *(points_world + shift for shift in shifts)])
