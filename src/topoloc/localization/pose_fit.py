@@ -162,13 +162,13 @@ class PoseFit(PointMatches):
     @cached_property
     def world_from_cam(self) -> Rigid3:
         """Return the pose."""
-        return self.cam_from_world.inverse()
+        return self.pose.cam_from_world.inverse()
 
     @cached_property
     def median_depth(self) -> float:
         """Return the median depth of the inliers, metres."""
         points_world = self.local_map.points_world[self.inlier_point_idx]
-        return float(np.median(self.cam_from_world.apply(points_world)[:, 2]))
+        return float(np.median(self.pose.cam_from_world.apply(points_world)[:, 2]))
 
     @cached_property
     def _bounding_box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:

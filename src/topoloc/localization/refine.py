@@ -87,7 +87,7 @@ def is_already_found(proposal: NodeProposal) -> bool:
     for known in search.belief.of_nodes:
         if known.probability < config.evidence.min_probability:
             continue
-        apart = known.fit.inlier_observations(1.0).errors_px(fit.camera, fit.cam_from_world)
+        apart = known.fit.inlier_observations(1.0).errors_px(fit.camera, fit.pose.cam_from_world)
         min_shared = 0.75 * len(apart)  # the rest may be occluded or out of view
         with np.errstate(invalid="ignore"):
             num_shared = np.count_nonzero(apart < radius_px)
@@ -122,7 +122,7 @@ def _refit_with_own_nodes(search: Search, first: PoseFit) -> PointMatches:
     )
     most = node_ids[np.argsort(-counts, kind="stable")[: config.num_nodes]]
     rows = search.map.topomap.rows_of(most)
-    return fit_around(search, first.cam_from_world, first.camera, config.radius_px, rows=rows)
+    return fit_around(search, first.pose.cam_from_world, first.camera, config.radius_px, rows=rows)
 
 
 def refit_around(search: Search, fit: PointMatches) -> PointMatches:
@@ -134,7 +134,7 @@ def refit_around(search: Search, fit: PointMatches) -> PointMatches:
         or fit.num_inliers < config.evidence.min_inliers
     ):
         return fit
-    return fit_around(search, fit.cam_from_world, fit.camera, config.guided.radius_px)
+    return fit_around(search, fit.pose.cam_from_world, fit.camera, config.guided.radius_px)
 
 
 def fit_around(

@@ -13,13 +13,13 @@ import topoloc
 from built_room import built_room
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization.answer import shape_as_motion
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts import correlated_errors
 from topoloc.localization.map_facts.correlated_errors import (
     ErrorShareMeasurement,
-    shape_as_motion,
 )
 from topoloc.mapping.topomap import TopoMetricMap
 

@@ -154,11 +154,11 @@ def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
 
     Without colours nothing tells floors apart, and a map with look-alike floors is honest about it.
     """
-    found, search = answer.pose, query.searches[0]
-    if found is None or not search.query.grey.any():  # only features
+    found, best, search = answer.pose, answer.best, query.searches[0]
+    if found is None or best is None or not search.query.grey.any():  # only features
         return None
     with search.query.clock.stage("appearance"):
-        agreement = compare_colours(search, found) if found.is_of_nodes else None
+        agreement = compare_colours(search, found) if best.evidence.is_of_nodes else None
     appearance, has_look_alikes = None, search.map.topomap.config.look_alike_floors
     text = "no colours can be compared"
     if agreement is not None:

@@ -29,11 +29,9 @@ from topoloc.localization.exact.patch_alignment import (
     load_last_step_weights,
     spread,
 )
-from topoloc.localization.fitted_weights import EvidenceWeights
 from topoloc.localization.guided import match_guided
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.pose_fit import LocalMap
-from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search
 
@@ -45,11 +43,6 @@ class PreciseFit:
     pose: AbsolutePose
     matches: PreciseMatches
     is_aligned: bool = False
-
-
-def _is_from_nodes(search: Search, evidence: Evidence | None) -> bool:
-    """Return whether nodes, and not virtual views, show what a pose was found by."""
-    return evidence is not None and isinstance(search.weights.of(evidence), EvidenceWeights)
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
@@ -89,9 +82,9 @@ def look_again(query: MapQuery, answer: Answer) -> Finding | None:
         ordered = [search, *(other for other in searches if other is not search)]
         for one in search.belief.hypotheses:
             gain, is_near = 0.0, one.log_odds > weights.crowding.min_log_odds
-            if is_near and _is_from_nodes(search, one.evidence):
-                around = Surroundings.of(ordered, one.fit.cam_from_world, weights)
-                gain = around.compute_gain(one.fit.cam_from_world)
+            if is_near and one.evidence.is_of_nodes:
+                around = Surroundings.of(ordered, one.fit.pose.cam_from_world, weights)
+                gain = around.compute_gain(one.fit.pose.cam_from_world)
             if gain > 0.0:
                 crowded.append((replace(one, log_odds=one.log_odds + gain), search))
             else:
@@ -115,16 +108,18 @@ def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
     Nodes near a pose from virtual views show something else. A calibration in doubt and a rotation
     during a rolling shutter would have to be estimated with the pose.
     """
-    pose, searches, first = answer.pose, query.searches, query.searches[0]
+    pose, best, searches = answer.pose, answer.best, query.searches
     weights = load_last_step_weights()
     if (
         pose is None
-        or not _is_from_nodes(first, pose.evidence)
+        or best is None
+        or not best.evidence.is_of_nodes
         or pose.calibration_doubt is not None
         or pose.frame_rotation_deg is not None
         or not _can_refine(searches, weights)
     ):
         return None
+    first = searches[0]
     # the feature type that found the pose comes first
     ordered = sorted(searches, key=lambda one: one.map.kind.name != pose.provenance.features)
     with first.query.clock.stage("last_step"):

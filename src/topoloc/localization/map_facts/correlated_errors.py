@@ -1,4 +1,4 @@
-"""Measure the correlated errors of a map's points and inflate pose covariances accordingly.
+"""Measure the correlated errors of a map's points, which inflate the covariances of poses.
 
 PnP treats the errors of n matches as independent, so its covariance shrinks with n. But the points
 of one node share the errors of the node's pose, depth and calibration. Let rho be the share of a
@@ -52,21 +52,6 @@ _SETTINGS: dict[str, Any] = {
     "percentile": 75.0,
 }
 """Settings of the measurement, part of the digest."""
-
-
-def shape_as_motion(
-    shared: Float[np.ndarray, "6 6"], noise: Float[np.ndarray, "6 6"], depth: float
-) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance of errors that move whole nodes, in place of a multiple of the noise.
-
-    Recorded poses are off by as much in angle as in distance over the points' `depth` (metres). rho
-    is measured in standard deviations of the noise, so the mean square in these stays.
-    """
-    # Nodes differ. Kitchen, 60 of 100 frames mapped, benchmarks/exactness.py, 2026-11-28: with a
-    # factor of 3, 37 of 40 poses are inside, with 2, 33.
-    factor, motion = 3.0, np.diag([depth**2] * 3 + [1.0] * 3)
-    of_shared, of_motion = np.linalg.solve(noise, [shared, motion])
-    return factor * np.trace(of_shared) / np.trace(of_motion) * motion
 
 
 @dataclass(frozen=True, eq=False)

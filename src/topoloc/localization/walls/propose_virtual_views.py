@@ -55,7 +55,7 @@ class VirtualViewProposal(Proposal):
                 fit = None if found is None else _fit(walls, found, cam_from_world, max_error_px)
                 if fit is None or fit.num_inliers < min_inliers or _is_found(search, fit):
                     return None
-                cam_from_world = fit.cam_from_world
+                cam_from_world = fit.pose.cam_from_world
             return None if _is_seen_by_nodes(search, cam_from_world) else fit
 
     def score(self, final: PointMatches) -> Hypothesis | None:
@@ -198,8 +198,8 @@ def _fit(
 def _score(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis:
     walls, search, num = proposal.walls, proposal.search, final.num_inliers
     guided = walls.guided(search.config.walls.rounds[-1][0])
-    sides = walls.sides_around(final.cam_from_world)
-    counts = count_virtual_views(sides, final.cam_from_world, guided)
+    sides = walls.sides_around(final.pose.cam_from_world)
+    counts = count_virtual_views(sides, final.pose.cam_from_world, guided)
     inflated = 1.0 + num * search.correlated_error_share + search.weights.walls.few_points / num
     covariance = final.pose.inflated(inflated)
     columns_img = final.features.points_img[final.inlier_query_idx, 0]
