@@ -19,8 +19,7 @@ from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact import last_step, patch_alignment
 from topoloc.localization.exact.last_step import Surroundings
-from topoloc.localization.exact.patch_alignment import load_last_step_weights
-from topoloc.localization.exact.patch_alignment_kernels import align_patches
+from topoloc.localization.exact.patch_alignment import align_patches, load_last_step_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization

@@ -15,16 +15,11 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from topoloc.bounds import Between
+from topoloc.compiled import kernel
 from topoloc.features.feature_types import FeatureType, GuidedThresholds
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided_kernels import (
-    largest_agreement,
-    match_projections,
-    predict_from_pixels,
-    project_undistorted,
-)
 from topoloc.localization.pose_fit import LocalMap
 
 
@@ -204,3 +199,166 @@ def count_consistent_displacements(
     """
     shifts = features.points_img[matches.query_idx] - predicted[matches.train_idx, :2]
     return int(largest_agreement(shifts, np.float32(within_px * camera.radius_scale)))
+
+
+# Numba kernels
+
+
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"})
+def _order_by_cell(key_points, radius, num_columns, num_rows):
+    """Return the rows of key points by cell of a grid, and the first position of each cell."""
+    cells = np.empty(len(key_points), np.int64)
+    starts = np.zeros(num_columns * num_rows + 1, np.int64)
+    for k in range(len(key_points)):
+        column = min(max(int(key_points[k, 0] / radius), 0), num_columns - 1)
+        row = min(max(int(key_points[k, 1] / radius), 0), num_rows - 1)
+        cells[k] = row * num_columns + column
+        starts[cells[k] + 1] += 1
+    starts = np.cumsum(starts)
+    order, free = np.empty(len(key_points), np.int64), starts.copy()
+    for k in range(len(key_points)):  # keeps the order within a cell
+        order[free[cells[k]]] = k
+        free[cells[k]] += 1
+    return order, starts
+
+
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"})
+def match_projections(
+    predicted,
+    map_descriptors,
+    key_points,
+    descriptors,
+    width,
+    height,
+    radius,
+    max_scale,
+    min_cosine,
+    min_similarity,
+    min_margin,
+):
+    """Find the most similar key point within `radius` pixels of each predicted map point.
+
+    Rows of `predicted` and `key_points` are (x, y, size, cosine and sine of the angle), float32. A
+    prediction is NaN if the point is out of view. A key point is rejected if its size differs by
+    more than the factor `max_scale`, or the cosine of the angle difference is below `min_cosine`.
+
+    Return the row of the key point for each map point (-1 for none) and the similarity (scalar
+    product). The best key point must exceed the others within the radius by `min_margin`. Others
+    within two pixels (L1) of it are exempt, because they are one blob at two scales.
+    """
+    num_columns, num_rows = int(width / radius) + 1, int(height / radius) + 1
+    order, starts = _order_by_cell(key_points, radius, num_columns, num_rows)
+    # by cell, so that the key points of neighbouring cells are read one after the other
+    sorted_points = np.empty((5, len(key_points)), np.float32)
+    for position in range(len(order)):
+        for part in range(5):
+            sorted_points[part, position] = key_points[order[position], part]
+    xs, ys, sizes, cosines, sines = sorted_points
+    near = np.empty(len(key_points), np.int64)
+    found = np.full(len(predicted), -1, np.int32)
+    similarities = np.zeros(len(predicted), np.float32)
+    for n in range(len(predicted)):
+        x, y = predicted[n, 0], predicted[n, 1]
+        if not (x > -radius and y > -radius and x < width + radius and y < height + radius):
+            continue
+        column, row = int(np.floor(x / radius)), int(np.floor(y / radius))
+        size, cosine, sine, count = predicted[n, 2], predicted[n, 3], predicted[n, 4], 0
+        first_column, last_column = max(column - 1, 0), min(column + 2, num_columns)
+        for r in range(max(row - 1, 0), min(row + 2, num_rows)):
+            first, last = r * num_columns + first_column, r * num_columns + last_column
+            for position in range(starts[first], starts[max(last, first)]):
+                dx, dy = xs[position] - x, ys[position] - y
+                # without branches, most of which no processor could foresee
+                near[count] = position
+                count += int(
+                    (dx * dx + dy * dy <= radius * radius)
+                    & (not cosines[position] * cosine + sines[position] * sine < min_cosine)
+                )
+        best, second, best_k = np.float32(-2), np.float32(-2), -1
+        for position in near[:count]:
+            scale = sizes[position] / size
+            if scale > max_scale or scale * max_scale < 1:
+                continue
+            k, product = order[position], np.float32(0)
+            for d in range(descriptors.shape[1]):
+                product += descriptors[k, d] * map_descriptors[n, d]
+            if product <= second:
+                continue
+            is_apart = best_k < 0 or (
+                abs(key_points[k, 0] - key_points[best_k, 0])
+                + abs(key_points[k, 1] - key_points[best_k, 1])
+                > 2
+            )
+            if product > best:
+                if is_apart:
+                    second = best
+                best, best_k = product, k
+            elif is_apart:
+                second = product
+        if best_k >= 0 and best >= min_similarity and best - second >= min_margin:
+            found[n], similarities[n] = best_k, best
+    return found, similarities
+
+
+@kernel()
+def largest_agreement(shifts, within):
+    """Return the largest number of rows of `shifts` (n, 2) that lie within this distance of one."""
+    most = 0
+    for i in range(len(shifts)):
+        count = 0
+        for j in range(len(shifts)):
+            dx, dy = shifts[i, 0] - shifts[j, 0], shifts[i, 1] - shifts[j, 1]
+            count += int(dx * dx + dy * dy < within * within)
+        most = max(most, count)
+    return most
+
+
+@kernel(error_model="numpy")
+def project_undistorted(points_world, rotation, translation, focal, centre, width, height):
+    """Project points into a camera without distortion.
+
+    Return the points in the camera frame (n, 3), metres, and their pixels (n, 2), NaN if out of
+    view.
+    """
+    points_cam, pixels = np.empty((len(points_world), 3)), np.empty((len(points_world), 2))
+    for n in range(len(points_world)):
+        p = points_world[n]
+        for i in range(3):
+            points_cam[n, i] = (
+                rotation[i, 0] * p[0]
+                + rotation[i, 1] * p[1]
+                + rotation[i, 2] * p[2]
+                + translation[i]
+            )
+        x, y, z = points_cam[n, 0], points_cam[n, 1], points_cam[n, 2]
+        u, v = x / z * focal[0] + centre[0], y / z * focal[1] + centre[1]
+        is_in_view = z > 1e-9 and u >= -0.5 and v >= -0.5 and u < width - 0.5 and v < height - 0.5
+        pixels[n, 0], pixels[n, 1] = (u, v) if is_in_view else (np.nan, np.nan)
+    return points_cam, pixels
+
+
+@kernel(error_model="numpy")
+def predict_from_pixels(points_cam, pixels, sizes, directions, rotation, focal):
+    """Predict rows (x, y, size, cosine and sine of the angle), float32, for points at known pixels.
+
+    Rows with NaN pixels are NaN. `sizes` (metres) and `directions` (unit vectors, world) describe
+    the patch of each descriptor. `focal` is in pixels.
+    """
+    predicted = np.full((len(pixels), 5), np.nan, np.float32)
+    for n in range(len(pixels)):
+        if not np.isfinite(pixels[n, 0]):
+            continue
+        x, y, z, d = points_cam[n, 0], points_cam[n, 1], points_cam[n, 2], directions[n]
+        along = rotation[2, 0] * d[0] + rotation[2, 1] * d[1] + rotation[2, 2] * d[2]
+        right = (
+            rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2] - x / z * along
+        )
+        down = rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2] - y / z * along
+        length = max(np.sqrt(right * right + down * down), 1e-9)
+        predicted[n, 0], predicted[n, 1], predicted[n, 2] = (
+            pixels[n, 0],
+            pixels[n, 1],
+            sizes[n] * focal / z,
+        )
+        predicted[n, 3], predicted[n, 4] = right / length, down / length
+    return predicted

@@ -21,8 +21,7 @@ from topoloc.features.matching import largest_similarities, match_features
 from topoloc.features.surf_detector_kernels import integral_image
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.guided import count_consistent_displacements
-from topoloc.localization.guided_kernels import match_projections
+from topoloc.localization.guided import count_consistent_displacements, match_projections
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.walls.place_comparison import estimate_upright_pose

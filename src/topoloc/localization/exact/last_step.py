@@ -27,7 +27,6 @@ from topoloc.localization.exact.patch_alignment import (
     PreciseMatches,
     align,
     load_last_step_weights,
-    spread,
 )
 from topoloc.localization.guided import match_guided
 from topoloc.localization.map_query import MapQuery
@@ -157,7 +156,7 @@ def refine_precisely(
     if fit is None:
         return None
     inliers = fit.matches.select(np.flatnonzero(fit.pose.inliers))
-    chosen, aligned = spread(inliers, around.camera, weights.max_aligned), fit
+    chosen, aligned = _spread(inliers, around.camera, weights.max_aligned), fit
     templates = searches[0].templates(chosen.node_ids)
     for reach_px in weights.reaches_px:
         moved = align(
@@ -174,6 +173,18 @@ def refine_precisely(
             return fit
         aligned = better
     return replace(aligned, is_aligned=True)
+
+
+def _spread(matches: PreciseMatches, camera: Camera, max_number: int) -> PreciseMatches:
+    """Return at most `max_number` matches: in turn the most similar one of each image cell."""
+    if len(matches) <= max_number:
+        return matches
+    num_columns = 16
+    columns, rows = (matches.points_img / np.float32(camera.width / num_columns)).astype(np.int64).T
+    cells = rows * num_columns + columns
+    order = np.lexsort((-matches.similarities, cells))
+    rank = np.arange(len(order)) - np.searchsorted(cells[order], cells[order])
+    return matches.select(np.sort(order[np.argsort(rank, kind="stable")[:max_number]]))
 
 
 @dataclass(frozen=True, eq=False)
