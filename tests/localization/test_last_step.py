@@ -16,10 +16,15 @@ from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.geometry.camera import Camera, UncalibratedCamera
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.exact import last_step, patch_alignment
 from topoloc.localization.exact.last_step import Surroundings
-from topoloc.localization.exact.patch_alignment import align_patches, load_last_step_weights
+from topoloc.localization.exact.patch_alignment import (
+    NodeTemplate,
+    PointTemplates,
+    align_patches,
+    load_last_step_weights,
+)
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
@@ -158,6 +163,28 @@ def test_a_shifted_patch_is_found_to_a_tenth_of_a_pixel(shift: tuple[float, floa
     assert np.abs(pixels[:2] - predicted[:2] - shift).max() < 0.1
     assert correlations[:2].min() > 0.98
     assert correlations[2] == -1.0
+
+
+def test_points_are_projected_and_coloured_by_the_node_of_each():
+    grey, colours = np.zeros((240, 320), np.uint8), np.full((60, 80, 3), 0.25, np.float32)
+    turned = Rigid3(exp_so3(np.array([0.0, 0.2, 0.0])), np.array([0.3, 0.0, -0.2]))
+    nodes = [
+        NodeTemplate(grey, CAMERA, turned, colours=colours),
+        NodeTemplate(grey, CAMERA.with_focal(300.0), Rigid3.identity()),
+        NodeTemplate(grey, CAMERA, Rigid3.identity(), colours=2.0 * colours),
+    ]
+    rng = np.random.default_rng(0)
+    points, of_point = rng.uniform([-1, -1, 3], [1, 1, 5], (30, 3)), np.arange(30) % 3
+    templates = PointTemplates(nodes, of_point)
+    (pixels,) = templates.project(templates.in_nodes(points)[None])
+    for k, node in enumerate(nodes):
+        in_node = node.world_from_cam.inverse().apply(points[of_point == k])
+        expected = node.camera.img_from_cam(in_node)
+        np.testing.assert_allclose(pixels[of_point == k], expected, atol=1e-9)
+    sampled = templates.sample_colours(points)
+    np.testing.assert_allclose(sampled[of_point == 0], 0.25)
+    np.testing.assert_allclose(sampled[of_point == 2], 0.5)
+    assert np.isnan(sampled[of_point == 1]).all()
 
 
 def test_a_stored_image_is_scaled_as_its_camera_is():

@@ -80,6 +80,9 @@ def test_a_map_whose_ids_are_no_rows_localizes_and_reports_ids(renumbered: Path)
     localizer = Localizer(topomap)
     ids = {summary.node_id for summary in topomap.summaries}
     assert min(ids) >= 1000
+    assert topomap.rows_of(summary.node_id for summary in topomap.summaries) == topomap.rows
+    with pytest.raises(KeyError):
+        topomap.rows_of(np.array([0]))
     for picture, world_from_cam in seen_ahead():
         result, before = localizer.localize(picture, WIDE), whole.localize(picture, WIDE)
         assert isinstance(result, Localization)

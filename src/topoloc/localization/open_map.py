@@ -108,18 +108,20 @@ class OpenMap:
 
     def local_map(self, rows: Sequence[Row]) -> LocalMap:
         """Return the points of these nodes, pooled."""
-        return LocalMap.concatenate(self._local_map.pool(rows))
+        return LocalMap.concatenate(self.local_maps(rows))
 
-    def descriptors(self, rows: Sequence[Row]) -> list[Float32[np.ndarray, "n d"]]:
-        """Return the descriptors of the points of each of these nodes."""
-        return [one.descriptors for one in self._local_map.pool(rows)]
+    def local_maps(self, rows: Sequence[Row]) -> list[LocalMap]:
+        """Return the points of each of these nodes."""
+        return self._local_map.pool(rows)
 
     def templates(self, node_ids: Iterable[NodeId]) -> list[NodeTemplate]:
         """Return the images of these nodes."""
         return self._template.pool(self.topomap.rows_of(node_ids))
 
-    def predict_at_node(self, row: Row, camera: Camera) -> Float32[np.ndarray, "n 5"]:
-        """Return `predict_key_points` of a node's points for a camera at the node's pose.
+    def predict_at_nodes(
+        self, rows: Sequence[Row], camera: Camera
+    ) -> list[Float32[np.ndarray, "n 5"]]:
+        """Return `predict_key_points` of each node's points for a camera at the node's pose.
 
         The predictions are cached for one camera.
         """
@@ -131,7 +133,7 @@ class OpenMap:
                 )
             )
             self._predicted_at_nodes = kept = (camera, read)
-        return kept[1](row)
+        return kept[1].pool(rows)
 
     def repeats(self, row: Row) -> Float[np.ndarray, "k 3"]:
         """Return the repetition shifts (metres, world) of a node: its moves without rotation.

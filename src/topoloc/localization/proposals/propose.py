@@ -204,10 +204,10 @@ def propose_node_viewpoints(search: Search) -> Iterator[NodeProposal]:
         return
     config, query, found = search.config.viewpoints, search.query, []
     features, camera = query.features, query.camera
+    rows = [candidate.row for candidate in search.ranked[: config.num_nodes]]
     with query.clock.stage("matching"):
-        for candidate in search.ranked[: config.num_nodes]:
-            local_map = search.map.local_map([candidate.row])
-            predicted = search.map.predict_at_node(candidate.row, camera)
+        predictions = search.map.predict_at_nodes(rows, camera)
+        for local_map, predicted in zip(search.map.local_maps(rows), predictions, strict=True):
             matches = match_predicted(features, local_map, predicted, camera, config.matching)
             num_alike = count_consistent_displacements(
                 features, matches, predicted, camera, shift_px

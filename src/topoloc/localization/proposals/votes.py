@@ -69,13 +69,13 @@ def count_votes(
     query = search.query
     ranked = search.map.coarse.rank(query.image, query.features, max_nodes)
     rows = list(dict.fromkeys(one.row for one in ranked))
-    descriptors = dict(zip(rows, search.map.descriptors(rows), strict=True))
-    rows = [row for row in rows if len(descriptors[row])]
+    points = dict(zip(rows, search.map.local_maps(rows), strict=True))
+    rows = [row for row in rows if len(points[row].descriptors)]
     if not rows or not len(query.features):
         return [], np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     apart = _distances_between(search, rows)
     strongest = query.features.descriptors[:num_features]
-    similarities = largest_similarities(strongest, [descriptors[row] for row in rows])
+    similarities = largest_similarities(strongest, [points[row].descriptors for row in rows])
     nearest, largest = similarities.argmax(axis=0), similarities.max(axis=0)
     elsewhere = np.where(apart[:, nearest] > 2.0, similarities, -1.0).max(axis=0)
     # where no node is elsewhere, a feature leads over none
