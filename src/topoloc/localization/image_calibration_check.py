@@ -102,7 +102,7 @@ def check_image_calibration(search: Search, fit: PoseFit, may_turn: bool) -> Ima
     if seen is None:
         return ImageCalibration()
     found = compare_with_calibration(
-        seen, fit.camera, fit.cam_from_world, may_turn=may_turn, scale=search.query.scale
+        seen, fit.camera, fit.pose.cam_from_world, may_turn=may_turn, scale=search.query.scale
     )
     if found.seen is None:
         return found
@@ -180,7 +180,7 @@ def find_focal_doubt(search: Search, fit: PoseFit) -> str:
     if seen is None:
         return ""
     moments = _prior(fit.camera, False).moments(free)
-    found = fit_jointly(seen, fit.cam_from_world, unchanged_camera(), moments, free.basis)
+    found = fit_jointly(seen, fit.pose.cam_from_world, unchanged_camera(), moments, free.basis)
     if found is None:
         return ""
     deviation, covariance = estimate_intrinsics(found)

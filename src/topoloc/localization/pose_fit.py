@@ -145,11 +145,6 @@ class PoseFit(PointMatches):
     pose: AbsolutePose
 
     @property
-    def cam_from_world(self) -> Rigid3:
-        """Return the pose."""
-        return self.pose.cam_from_world
-
-    @property
     def inlier_query_idx(self) -> Int[np.ndarray, " n"]:
         """Return the feature of each inlier."""
         return self.matches.query_idx[self.pose.inliers]

@@ -190,7 +190,7 @@ def _fit(
         fit_pose(found.features, walls.camera, *parts, config, start)
         for start in ((near, walls.camera), None)
     )
-    if isinstance(anew, PoseFit) and _are_near(walls.search, anew.cam_from_world, near):
+    if isinstance(anew, PoseFit) and _are_near(walls.search, anew.pose.cam_from_world, near):
         refined = max(refined, anew, key=lambda fit: fit.num_inliers)
     return refined if isinstance(refined, PoseFit) else None
 
