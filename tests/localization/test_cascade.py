@@ -23,8 +23,17 @@ from topoloc.features.features import Features
 from topoloc.features.learned import GridDescriptors, SingleLevelDescriptors
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.calibration_check import CalibrationMismatch
+from topoloc.geometry.joint_camera.camera_hypotheses import (
+    CameraBelief,
+    CameraHypothesis,
+    WeighedCamera,
+)
 from topoloc.localization.belief import Hypothesis
-from topoloc.localization.image_calibration_check import ImageCalibration, check_image_calibration
+from topoloc.localization.image_calibration_check import (
+    ImageCalibration,
+    SeenCamera,
+    check_image_calibration,
+)
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.pose_fit import PoseFit
@@ -161,8 +170,14 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_other_features(
         shift = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         doubt = CalibrationMismatch(200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), [part], shift)
         is_doubted = search.query.feature_config.kind == kind
+        off = WeighedCamera(CameraHypothesis(), 1.0, shift, np.eye(6))
+        other = SeenCamera(
+            fit.camera, fit.pose.cam_from_world, CameraBelief(off.hypothesis, [off]), np.zeros(3)
+        )
         return ImageCalibration(
-            None if part == "distortion" else seen, doubt if is_doubted else None
+            None if part == "distortion" else seen,
+            other if is_doubted else None,
+            doubt if is_doubted else None,
         )
 
     monkeypatch.setattr("topoloc.localization.checks.check_image_calibration", doubted)

@@ -79,6 +79,7 @@ def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scal
                 result.world_from_cam.translation - frame.world_from_cam.translation
             )
             assert way < 3.0 * np.sqrt(np.trace(result.camera_covariance[:3, :3]))
+            assert way < 0.25, "the pose is by the camera that the image shows"
     assert num_named >= 0.8 * len(open_sequence(queries))
 
 

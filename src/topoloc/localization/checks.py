@@ -11,28 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.geometry.calibration_check import CalibrationMismatch
-from topoloc.geometry.joint_camera.camera_hypotheses import (
-    CameraBelief,
-    CameraHypothesis,
-    WeighedCamera,
-)
 from topoloc.localization.answer import Answer, Finding, probability_within
 from topoloc.localization.belief import Hypothesis
-from topoloc.localization.evidence import compute_normalized_uncertainty
 from topoloc.localization.exact.appearance import check_colours
 from topoloc.localization.exact.last_step import look_again, refine_answer
-from topoloc.localization.image_calibration_check import TurningCamera, check_image_calibration
+from topoloc.localization.image_calibration_check import SeenCamera, check_image_calibration
 from topoloc.localization.map_query import MapQuery
-from topoloc.localization.result import Localization
 
 
 def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
     """Compare the image with its calibration, and with a camera that turned during the image.
 
-    If the image contradicts its calibration, the covariance grows by the shift that the error
-    causes. The probability falls accordingly. If the camera turned, the pose is that of the middle
-    row.
+    If the image contradicts its calibration, or if the camera turned, the pose is by the camera
+    that the image shows. Its uncertainty is added to the covariance and lowers the probability.
     """
     search, best, pose = answer.search, answer.best, answer.pose
     if pose is None or best is None or best.fit.pose.camera is not None:
@@ -40,50 +31,32 @@ def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
     with search.query.clock.stage("calibration"):
         found = check_image_calibration(search, best.fit, best.evidence.is_of_nodes)
     facts: dict[str, Any] = {"seen_camera": found.seen}
-    if found.doubt is not None:
-        return _doubt_camera(answer, pose, best, facts, found.doubt)
-    if found.turning is None:
+    if found.other is None:
         return Finding("camera", "the image agrees with its calibration", facts=facts)
-    angle_deg = float(np.rad2deg(np.linalg.norm(found.turning.rotation)))
-    text = f"the camera turned by {angle_deg:.2f} degrees during the image"
-    facts["frame_rotation_deg"] = angle_deg
-    undone = _undo_rotation(best, found.turning)
-    return Finding("camera", text, facts=facts, hypothesis=undone)
-
-
-def _doubt_camera(
-    answer: Answer,
-    pose: Localization,
-    best: Hypothesis,
-    facts: dict[str, Any],
-    doubt: CalibrationMismatch,
-) -> Finding:
-    """Return the finding of a contradicted calibration: an uncertain pose, or a refusal."""
-    search, text = answer.search, f"the calibration is doubtful: {doubt}"
-    # inliers by the wrong camera hide a part of the shift: half of it in `benchmarks/inputs.py`
-    half = best.covariance + 0.25 * np.outer(doubt.shift, doubt.shift)
-    shifted = WeighedCamera(CameraHypothesis(), 1.0, doubt.shift, half)
-    factor = probability_within(search, best, CameraBelief(shifted.hypothesis, [shifted]))
+    if found.doubt is not None:
+        text = f"the calibration is doubtful: {found.doubt}"
+        facts["calibration_doubt"] = found.doubt
+    else:
+        angle_deg = float(np.rad2deg(np.linalg.norm(found.other.rotation)))
+        text = f"the camera turned by {angle_deg:.2f} degrees during the image"
+        facts["frame_rotation_deg"] = angle_deg
+    factor = probability_within(search, best, found.other.belief)
+    refusal = None
     if factor * pose.probability < search.config.evidence.min_probability:
-        return Finding("camera", text, factor, facts, refusal=("too_few_inliers", text))
-    covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
-    uncertainty = compute_normalized_uncertainty(
-        covariance, best.fit.median_depth, search.config.evidence
-    )
-    evidence = replace(best.evidence, doubt=max(best.evidence.doubt, uncertainty))
-    penalized = replace(best, covariance=covariance, evidence=evidence)
-    facts["calibration_doubt"] = doubt
-    return Finding("camera", text, factor, facts, hypothesis=penalized)
+        refusal = ("too_few_inliers", text)
+    by_image = _with_camera(best, found.other)
+    return Finding("camera", text, factor, facts, by_image, refusal=refusal)
 
 
-def _undo_rotation(best: Hypothesis, turning: TurningCamera) -> Hypothesis:
-    """Return the hypothesis as if all rows had been read with the middle one."""
-    fit = best.fit
-    points_img = turning.undo(fit.features.points_img, fit.camera)
-    covariance = fit.pose.covariance + turning.covariance
-    pose = replace(fit.pose, cam_from_world=turning.cam_from_world, covariance=covariance)
-    fit = replace(fit, features=replace(fit.features, points_img=points_img), pose=pose)
-    return replace(best, fit=fit, covariance=best.covariance + turning.covariance)
+def _with_camera(best: Hypothesis, other: SeenCamera) -> Hypothesis:
+    """Return the hypothesis by the camera that the image shows, as if all rows had been read with
+    the middle one."""
+    fit, added = best.fit, other.belief.covariance
+    features = replace(fit.features, points_img=other.undo_rotation(fit.features.points_img))
+    covariance = fit.pose.covariance + added
+    pose = replace(fit.pose, cam_from_world=other.cam_from_world, covariance=covariance)
+    fit = replace(fit, features=features, camera=other.camera, pose=pose)
+    return replace(best, fit=fit, covariance=best.covariance + added)
 
 
 def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:

@@ -179,14 +179,20 @@ class PoseFit(PointMatches):
         (low, high), (other_low, other_high) = self._bounding_box, other._bounding_box
         return bool(np.all(low <= other_high) and np.all(other_low <= high))
 
+    @property
+    def match_observations(self) -> PointObservations:
+        """Return all matches, in the image of the features."""
+        rows, points = self.matches.query_idx, self.local_map
+        return PointObservations(
+            self.features.points_img[rows],
+            points.points_world[self.matches.train_idx],
+            points.covariances[self.matches.train_idx],
+        )
+
     def inlier_observations(self, scale: float) -> PointObservations:
         """Return the inliers, in an image `scale` times as wide as that of the features."""
-        rows = self.inlier_point_idx
-        return PointObservations(
-            self.features.points_img[self.inlier_query_idx],
-            self.local_map.points_world[rows],
-            self.local_map.covariances[rows],
-        ).to_image_scale(scale)
+        rows = np.flatnonzero(self.pose.inliers)
+        return self.match_observations.select(rows).to_image_scale(scale)
 
 
 def fit_pose(

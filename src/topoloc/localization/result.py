@@ -82,8 +82,8 @@ class Localization(_Result):
             from the map and is common to images taken nearby.
         frame_rotation_deg: angle by which a camera with a rolling shutter evidently turned during
             the image. The pose is that of the middle row.
-        calibration_doubt: mismatch of the image and its calibration. The covariance and probability
-            include it.
+        calibration_doubt: mismatch of the image and its calibration. The pose is by the camera that
+            the image shows.
         seen_camera: calibration estimate of this image (`geometry/calibration_check.py`), or None.
         geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
         appearance: probability that the colours in view are this floor's and not another's, if both

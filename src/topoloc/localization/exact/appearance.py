@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from msgspec import Struct
 
 from topoloc.errors import FeatureTypeError
+from topoloc.geometry.camera import Camera
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.answer import Answer, Finding
 from topoloc.localization.evidence import sample_rows
@@ -86,11 +87,10 @@ class ColourAgreement:
         return 1.0 / (1.0 + math.exp(-share * (log_odds + weights.bias) - clear))
 
 
-def compare_colours(search: Search, found: Localization) -> ColourAgreement | None:
+def compare_colours(search: Search, found: Localization, camera: Camera) -> ColourAgreement | None:
     """Compare the colours of the points in view. None: an image is grey, or few points are."""
-    weights, query, opened = load_appearance_weights(), search.query, search.map
-    # an uncalibrated camera is estimated with the pose
-    camera, in_query = found.provenance.camera or query.camera, small_colours(query.image)
+    weights, opened = load_appearance_weights(), search.map
+    in_query = small_colours(search.query.image)
     if in_query is None:
         return None
     # the nodes near a pose beside a bend look past its walls; those of its inliers do not
@@ -158,7 +158,8 @@ def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
     if found is None or best is None or not search.query.grey.any():  # only features
         return None
     with search.query.clock.stage("appearance"):
-        agreement = compare_colours(search, found) if best.evidence.is_of_nodes else None
+        is_of_nodes = best.evidence.is_of_nodes
+        agreement = compare_colours(search, found, best.fit.camera) if is_of_nodes else None
     appearance, has_look_alikes = None, search.map.topomap.config.look_alike_floors
     text = "no colours can be compared"
     if agreement is not None:

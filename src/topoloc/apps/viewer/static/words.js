@@ -52,7 +52,7 @@ export function sentences(result) {
     said.push(`Standard deviation ${sigmas}, probability ${result.probability.toFixed(2)}.`);
     if (result.num_matches) said.push(`${result.num_inliers} of ${result.num_matches} matches agree, most with node ${result.node}.`);
     if (result.focal_length_px) said.push(`Estimated focal length: ${result.focal_length_px.toFixed(0)} pixels.`);
-    if (result.calibration_doubt) said.push("The image contradicts its calibration, so the uncertainty is larger.");
+    if (result.calibration_doubt) said.push("The image contradicts its calibration: the pose is by the camera that it shows.");
     const earth = result.geopose?.position;
     if (earth) said.push(`On earth: ${earth.lat.toFixed(7)}°, ${earth.lon.toFixed(7)}°, height ${earth.h.toFixed(1)} m.`);
   } else {
