@@ -260,10 +260,8 @@ def test_a_session_that_does_not_fit_changes_nothing(
         "--poses",
         "unchecked",
     )
-    assert (
-        "its calibration is not that of its camera: the map recognises 7 of 7 pictures where the"
-        " focal length is about 260" in wrong
-    )
+    assert "its calibration is not that of its camera: 12 of 12 pictures contradict it" in wrong
+    assert "the picture says f = 26" in wrong
     assert "nothing to undo" in complaint("undo", map_file)
     assert "at least one recording" in complaint("update", map_file, status=2)
     assert map_file.read_bytes() == before

@@ -53,12 +53,20 @@ _MAX_LOG_RATIO = math.log(1.04)
 def check_query_calibration(name: str, results: Sequence[Localization | NotLocalized]) -> None:
     """Raise CalibrationError if the localization results of a session's images together contradict
     its calibration. The error begins with `name`."""
-    for verdict in check_camera_calibrations(results):
-        if verdict.is_contradicted:
-            raise CalibrationError(
-                f"{name}: its calibration is not that of its camera: {verdict}; the map stays as it"
-                " is"
-            )
+    found = [
+        str(verdict) for verdict in check_camera_calibrations(results) if verdict.is_contradicted
+    ]
+    localized = [result for result in results if isinstance(result, Localization)]
+    doubts = [result.calibration_doubt for result in localized if result.calibration_doubt]
+    # images of few places together say nothing, but each may contradict it
+    if not found and len(doubts) >= 3 and 2 * len(doubts) > len(localized):
+        doubts.sort(key=lambda doubt: doubt.focal_length_px)
+        middle = doubts[len(doubts) // 2]
+        found = [f"{len(doubts)} of {len(localized)} pictures contradict it: {middle}"]
+    if found:
+        raise CalibrationError(
+            f"{name}: its calibration is not that of its camera: {found[0]}; the map stays as it is"
+        )
 
 
 def check_focal_length(
