@@ -346,7 +346,7 @@ def _clustered_noise(
     information: Float[np.ndarray, "k k"], gradients: Float[np.ndarray, "m k"], cells: np.ndarray
 ) -> float:
     """Return the factor of the variance of focal length and principal point by errors that are
-    common to parts of the image, at least 1 (see `pose_matches.py`)."""
+    common to parts of the image, at least 1 (see `absolute_pose.py`)."""
     used, number = np.unique(cells, return_inverse=True)
     if len(used) < 8:
         return 1.0
