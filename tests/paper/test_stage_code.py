@@ -100,7 +100,7 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc_training/coarse_training.py", {*LEARNING, "learning PoseNet"}),
         ("topoloc/mapping/landmarks.py", {"mapping"}),
         ("topoloc/mapping/storage/map_reading.py", {"mapping", *ASKING, *PEERS}),
-        ("topoloc/features/surf_detector_kernels.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc/features/surf_descriptors.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc_paper/colmap_worker.py", {"pycolmap, SIFT"}),
         ("topoloc_paper/pose_losses.py", {"learning PoseNet"}),
     ],

@@ -16,24 +16,16 @@ matters, choose SIFT (`topoloc.features.sift`). Its patent, US 6,711,293, expire
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
 
-from topoloc.compiled import num_threads as default_num_threads, parallel_for_rows
+from topoloc.compiled import kernel, num_threads as default_num_threads, parallel_for_rows
 from topoloc.features.features import Features
-from topoloc.features.surf_descriptor_kernels import describe, orient, smooth_rows
-from topoloc.features.surf_detector_kernels import detect_band, integral_image, split_columns
+from topoloc.features.surf_descriptors import DESCRIPTOR_LENGTH, describe
 
-DESCRIPTOR_LENGTH = 64
 MIN_FILTER_PX = 9  # this filter has a sigma of 1.2 pixels (Bay et al. 2008, 3.3)
 FILTER_INCREMENT_PX = 6
 SIGMA_PER_FILTER_PX = 1.2 / MIN_FILTER_PX
-PATCH_SAMPLES = 21
-# Sample spacings in pixels for which smoothed images are made, from the smallest key points on.
-LEVEL_RATIO = 1.2
-LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 
 
 def extract_surf(
@@ -59,7 +51,7 @@ def extract_surf(
         return Features.empty(DESCRIPTOR_LENGTH)
     points, sizes = np.ascontiguousarray(found[:, :2]), found[:, 2].copy()
     scales = sizes * np.float32(SIGMA_PER_FILTER_PX)
-    angles, descriptors = _describe(integral, points, scales, num_parts)
+    angles, descriptors = describe(integral, points, scales, num_parts)
     return Features(points, sizes, angles, found[:, 3].copy(), descriptors)
 
 
@@ -90,15 +82,15 @@ def _detect(
     def detect_part(part: int, _: int) -> None:
         for octave, edges in octaves.items():
             step, size = 1 << octave, int(edges[-1, -1])
-            first, last = _part_bounds(height // step, part, num_parts)
+            first, last = (height // step * one // num_parts for one in (part, part + 1))
             columns, top, rows = edges, 0, integral
             if step > 1:
                 top = max((first - 1) * step - size, 0)
                 bottom = min(last * step + size + step, height + 1)
                 rows = scratch[part][: (bottom - top) * split_width(step)].reshape(bottom - top, -1)
-                split_columns(integral, step, top, rows)
+                _split_columns(integral, step, top, rows)
                 columns = edges % step * (split_width(step) // step) + edges // step
-            found[octave, part] = detect_band(
+            found[octave, part] = _detect_band(
                 rows, top, height, width, edges, columns, step, first, last, threshold
             )
 
@@ -125,77 +117,201 @@ def _detect(
     return np.concatenate([found[key] for key in sorted(found)])
 
 
-def _part_bounds(num_rows: int, part: int, num_parts: int) -> tuple[int, int]:
-    """Return the first row of a part and the row after its last one."""
-    return num_rows * part // num_parts, num_rows * (part + 1) // num_parts
+@kernel()
+def integral_image(image):
+    """Return the integral image, (h + 1, w + 1) int32 modulo 2^32. Entry (y, x) is the sum of
+    image[:y, :x]. The difference of wrapped sums is still right if the box itself fits."""
+    height, width = image.shape
+    integral = np.empty((height + 1, width + 1), np.int32)
+    integral[0] = 0
+    for y in range(height):
+        source = image[y]
+        above = integral[y][1:]
+        integral[y + 1, 0] = 0
+        below = integral[y + 1][1:]
+        total = np.int32(0)
+        for x in range(width):
+            total = np.int32(total + source[x])
+            below[x] = total
+        for x in range(width):
+            below[x] = np.int32(below[x] + above[x])
+    return integral
 
 
-def _select_part(
-    rows: Int64[np.ndarray, " n"], part: int, num_parts: int
-) -> Int64[np.ndarray, " m"]:
-    first, last = _part_bounds(len(rows), part, num_parts)
-    return rows[first:last]
+@kernel()
+def _split_columns(integral, step, first, split):
+    """Fill `split` with rows of the integral image from `first` on, with reordered columns: those
+    at 0, step, 2 step, ..., then 1, 1 + step, ...
 
-
-@dataclass(frozen=True)
-class _Level:
-    """Hold a smoothed image of every step-th pixel. Its pixel (0, 0) is at (offset, offset) of the
-    image. `share` is that of `smooth_rows`."""
-
-    pixels: Float32[np.ndarray, "lh lw"]
-    step: int
-    box: int
-    share: float
-
-    @property
-    def offset(self) -> float:
-        return (self.box + 1) / 2
-
-
-def _empty_level(integral: Int32[np.ndarray, "h1 w1"], spacing: float) -> _Level:
-    """Return an empty level. Once filled and read bilinearly, it is as smooth as the image averaged
-    over windows of `spacing` pixels.
-
-    Bilinear reads have a mean variance of step^2 / 6, on top of a box's (side^2 - 1) / 12. OpenCV
-    reads the image bilinearly, then averages. This has a variance of (spacing^2 + 1) / 12 + 1 / 6.
+    The reads of a filter bank sampled at every step-th pixel are then contiguous, so that its loops
+    vectorise.
     """
-    step = 1 << max(int(np.log2(spacing / 2.2)), 0)
-    side = float(np.sqrt(spacing**2 + 4 - 2 * step**2))
-    box = int(side)
-    height, width = ((size - 1 - (box + 2)) // step + 1 for size in integral.shape)
-    share = ((box + 2) ** 2 - side**2) / ((box + 2) ** 2 - box**2)
-    return _Level(np.empty((height, width), np.float32), step, box, share)
+    width, phase_length = integral.shape[1], split.shape[1] // step
+    for y in range(split.shape[0]):
+        source = integral[first + y]
+        for phase in range(step):
+            target = split[y, phase * phase_length : (phase + 1) * phase_length]
+            for j in range((width - phase + step - 1) // step):
+                target[j] = source[phase + j * step]
 
 
-def _describe(
-    integral: Int32[np.ndarray, "h1 w1"],
-    points: Float32[np.ndarray, "n 2"],
-    scales: Float32[np.ndarray, " n"],
-    num_parts: int,
-) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 64"]]:
-    """Return angles in radians and descriptors of key points at these scales (sigma, pixels)."""
-    angles = np.zeros(len(points), np.float32)
-    descriptors = np.empty((len(points), DESCRIPTOR_LENGTH), np.float32)
-    # OpenCV averages over a whole number of pixels a side
-    spacings = (np.floor(PATCH_SAMPLES * scales) / PATCH_SAMPLES).astype(np.float32)
-    level_idx = np.searchsorted(LEVEL_SPACINGS[:-1] * np.sqrt(LEVEL_RATIO), spacings)
-    used = np.unique(level_idx).tolist()
-    levels = {k: _empty_level(integral, float(LEVEL_SPACINGS[k])) for k in used}
+# No fastmath: a fused product here rounded differently when compiled in this process and when read
+# from the compiler's cache.
+@kernel(error_model="numpy")
+def _hessian_row(sums, top, edges, columns, rows, out):
+    """Compute the determinants of one row of filters with their upper edge at row `top` of `sums`.
 
-    def prepare_part(part: int, _: int) -> None:
-        for level in levels.values():
-            first, last = _part_bounds(len(level.pixels), part, num_parts)
-            smooth_rows(integral, level.box, level.share, level.step, level.pixels, first, last)
-        orient(integral, points, scales, _select_part(rows_by_y, part, num_parts), angles)
+    edges are the ten edge positions of the pattern in pixels. columns are their places after
+    `_split_columns`.
+    """
+    rows_xx, rows_yy, rows_xy = rows[0], rows[1], rows[2]
+    s, e = sums[top:], edges
+    i0, i1, i2, i3, i4 = s[0], s[e[1]], s[e[2]], s[e[3]], s[e[4]]
+    i5, i6, i7, i8, i9 = s[e[5]], s[e[6]], s[e[7]], s[e[8]], s[e[9]]
+    # A second derivative is the whole box minus three times its middle third: two boxes instead of
+    # three.
+    for x in range(rows.shape[1]):
+        rows_xx[x] = np.int32(i7[x] - i2[x])
+        rows_yy[x] = np.int32(i9[x] - i0[x] - 3 * (i6[x] - i3[x]))
+        rows_xy[x] = np.int32(i4[x] - i1[x] - i8[x] + i5[x])
+    xx_3, xx_6, xx_9 = rows_xx[columns[3] :], rows_xx[columns[6] :], rows_xx[columns[9] :]
+    yy_2, yy_7 = rows_yy[columns[2] :], rows_yy[columns[7] :]
+    xy_1, xy_4 = rows_xy[columns[1] :], rows_xy[columns[4] :]
+    xy_5, xy_8 = rows_xy[columns[5] :], rows_xy[columns[8] :]
+    lobe = np.float32(1.0) / np.float32((edges[6] - edges[3]) * (edges[7] - edges[2]))
+    # 0.9^2 = 0.81, Bay et al. 2008, Eq. 3.
+    quarter = np.float32(0.9) / np.float32((edges[4] - edges[1]) * (edges[4] - edges[1]))
+    for x in range(out.shape[0]):
+        dxx = np.float32(np.int32(xx_9[x] - rows_xx[x] - 3 * (xx_6[x] - xx_3[x]))) * lobe
+        dyy = np.float32(np.int32(yy_7[x] - yy_2[x])) * lobe
+        dxy = np.float32(np.int32(xy_4[x] - xy_1[x] - xy_8[x] + xy_5[x])) * quarter
+        out[x] = dxx * dyy - dxy * dxy
 
-    def describe_part(part: int, _: int) -> None:
-        for k, level in levels.items():
-            rows = _select_part(rows_by_y[level_idx[rows_by_y] == k], part, num_parts)
-            given = points, spacings, angles, rows, descriptors
-            describe(level.pixels, level.offset, level.step, *given)
 
-    # From the top of the image down, so that the reads of a thread stay in its core's cache.
-    rows_by_y = np.argsort(points[:, 1], kind="stable")
-    parallel_for_rows(prepare_part, num_parts, num_parts)
-    parallel_for_rows(describe_part, num_parts, num_parts)
-    return angles, descriptors
+@kernel(fastmath=True, error_model="numpy")
+def _mark_candidates(below, up, mid, down, above, first, last, threshold, marks):
+    """Set marks[j] = 1 if mid[j] exceeds the threshold and six of its 26 neighbours. This cheap
+    filter vectorises."""
+    count = last - first
+    centre, left, right = mid[first:last], mid[first - 1 : last - 1], mid[first + 1 : last + 1]
+    north, south = up[first:last], down[first:last]
+    smaller, larger = below[first:last], above[first:last]
+    for j in range(count):
+        value = centre[j]
+        beside = max(max(left[j], right[j]), max(north[j], south[j]))
+        ring = max(beside, max(max(smaller[j], larger[j]), threshold))
+        marks[j] = np.uint8(value > ring)
+
+
+@kernel()
+def _is_maximum(ring, layer, up, mid, down, j):
+    value = ring[layer, mid, j]
+    for other in range(layer - 1, layer + 2):
+        for row in (up, mid, down):
+            for column in range(j - 1, j + 2):
+                if ring[other, row, column] >= value and not (
+                    other == layer and row == mid and column == j
+                ):
+                    return False
+    return True
+
+
+@kernel(error_model="numpy")
+def _refine(ring, layer, up, mid, down, j):
+    """Return (ok, x, y, scale): the vertex of the quadratic through the 27 determinants, in grid
+    units. ok is False beyond one unit."""
+    below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
+    value = np.float64(here[mid, j])
+    gx, gy = (here[mid, j + 1] - here[mid, j - 1]) * 0.5, (here[down, j] - here[up, j]) * 0.5
+    gs = (above[mid, j] - below[mid, j]) * 0.5
+    xx = here[mid, j + 1] - 2.0 * value + here[mid, j - 1]
+    yy = here[down, j] - 2.0 * value + here[up, j]
+    ss = above[mid, j] - 2.0 * value + below[mid, j]
+    xy = (here[down, j + 1] - here[down, j - 1] - here[up, j + 1] + here[up, j - 1]) * 0.25
+    xs = (above[mid, j + 1] - above[mid, j - 1] - below[mid, j + 1] + below[mid, j - 1]) * 0.25
+    ys = (above[down, j] - above[up, j] - below[down, j] + below[up, j]) * 0.25
+    cofactor_xx, cofactor_xy, cofactor_xs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - yy * xs
+    determinant = xx * cofactor_xx + xy * cofactor_xy + xs * cofactor_xs
+    if determinant == 0.0:
+        return False, 0.0, 0.0, 0.0
+    cofactor_yy, cofactor_ys, cofactor_ss = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
+    dx = -(cofactor_xx * gx + cofactor_xy * gy + cofactor_xs * gs) / determinant
+    dy = -(cofactor_xy * gx + cofactor_yy * gy + cofactor_ys * gs) / determinant
+    ds = -(cofactor_xs * gx + cofactor_ys * gy + cofactor_ss * gs) / determinant
+    return max(abs(dx), abs(dy), abs(ds)) <= 1.0, dx, dy, ds
+
+
+@kernel(error_model="numpy")
+def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, count):
+    """Append the maxima of row i of this layer to `found` (x, y, size, response). Return the array,
+    enlarged if necessary, and its count."""
+    num_columns = ring.shape[2]
+    margin = sizes[layer + 1] // 2 // step + 1
+    up, mid, down = (i - 1) % 3, i % 3, (i + 1) % 3
+    last = num_columns - margin
+    below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
+    _mark_candidates(
+        below[mid], here[up], here[mid], here[down], above[mid], margin, last, threshold, marks
+    )
+    num_marks = last - margin
+    for k in range(num_marks, min((num_marks + 7) // 8 * 8, marks.shape[0])):
+        marks[k] = 0
+    size = sizes[layer]
+    for word in range((num_marks + 7) // 8):
+        if words[word] == 0:
+            continue
+        for k in range(word * 8, word * 8 + 8):
+            j = k + margin
+            if marks[k] == 0 or not _is_maximum(ring, layer, up, mid, down, j):
+                continue
+            ok, dx, dy, ds = _refine(ring, layer, up, mid, down, j)
+            if not ok:
+                continue
+            if count == found.shape[0]:
+                found = np.concatenate((found, np.empty_like(found)))
+            half = (size - 1) * 0.5
+            found[count, 0] = step * (j - size // 2 // step) + half + dx * step
+            found[count, 1] = step * (i - size // 2 // step) + half + dy * step
+            found[count, 2] = np.rint(size + ds * (size - sizes[layer - 1]))
+            found[count, 3] = ring[layer, mid, j]
+            count += 1
+    return found, count
+
+
+@kernel(error_model="numpy")
+def _detect_band(sums, sums_top, height, width, edges, columns, step, first, last, threshold):
+    """Return the maxima (m, 4) = x, y, size, response in rows [first, last) of an octave's grid
+    (every step-th pixel).
+
+    sums are rows of the integral image of a (height, width) image from `sums_top` on, ordered by
+    `_split_columns`. edges and columns (n, 10) describe the filters of the octave's n layers. Only
+    three rows of each layer are in memory at a time.
+    """
+    sizes = edges[:, 9].copy()
+    num_layers, num_rows, num_columns = sizes.shape[0], height // step, width // step
+    ring = np.zeros((num_layers, 3, num_columns), np.float32)
+    rows = np.empty((3, sums.shape[1]), np.int32)
+    marks = np.zeros((num_columns + 7) // 8 * 8, np.uint8)
+    words = marks.view(np.uint64)
+    found = np.empty((256, 4), np.float32)
+    count = 0
+    for i in range(max(first - 1, 0), min(last + 1, num_rows)):
+        for layer in range(num_layers):
+            size = sizes[layer]
+            margin = size // 2 // step
+            if i < margin or (i - margin) * step + size > height or width < size:
+                continue
+            out = ring[layer, i % 3, margin : margin + 1 + (width - size) // step]
+            _hessian_row(
+                sums, (i - margin) * step - sums_top, edges[layer], columns[layer], rows, out
+            )
+        row = i - 1
+        if row < first:
+            continue
+        for layer in range(1, num_layers - 1):
+            margin = sizes[layer + 1] // 2 // step + 1
+            if margin <= row < num_rows - margin and num_columns > 2 * margin:
+                found, count = _collect_row(
+                    ring, layer, row, sizes, step, threshold, marks, words, found, count
+                )
+    return found[:count].copy()

@@ -18,7 +18,7 @@ from topoloc.compiled import is_cached
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import MatchingConfig
 from topoloc.features.matching import largest_similarities, match_features
-from topoloc.features.surf_detector_kernels import integral_image
+from topoloc.features.surf import integral_image
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import count_consistent_displacements, match_projections

@@ -1,10 +1,18 @@
-"""Implement the Numba kernels of `surf`, second half: orientation and descriptor of each key
-point."""
+"""Describe key points of `surf`: an image pyramid, and orientation and descriptor of each point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float32, Int32
 
-from topoloc.compiled import kernel
+from topoloc.compiled import kernel, parallel_for_rows
 
+DESCRIPTOR_LENGTH = 64
+# Sample spacings in pixels for which smoothed images are made, from the smallest key points on.
+LEVEL_RATIO = 1.2
+LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 PATCH_SIZE = 20  # samples a side of the described window, in units of the key point's scale s
 ORIENTATION_RADIUS = 6  # in units of s
 SECTOR_DEG = 5  # step of the sliding orientation window
@@ -39,8 +47,74 @@ PATCH_WEIGHTS = np.zeros((PATCH_SIZE, PADDED_SIZE), np.float32)
 PATCH_WEIGHTS[:, :PATCH_SIZE] = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3))
 
 
+@dataclass(frozen=True)
+class _Level:
+    """Hold a smoothed image of every step-th pixel. Its pixel (0, 0) is at (offset, offset) of the
+    image, with offset = (box + 1) / 2. `share` is that of `_smooth_rows`."""
+
+    pixels: Float32[np.ndarray, "lh lw"]
+    step: int
+    box: int
+    share: float
+
+
+def _empty_level(integral: Int32[np.ndarray, "h1 w1"], spacing: float) -> _Level:
+    """Return an empty level. Once filled and read bilinearly, it is as smooth as the image averaged
+    over windows of `spacing` pixels.
+
+    Bilinear reads have a mean variance of step^2 / 6, on top of a box's (side^2 - 1) / 12. OpenCV
+    reads the image bilinearly, then averages. This has a variance of (spacing^2 + 1) / 12 + 1 / 6.
+    """
+    step = 1 << max(int(np.log2(spacing / 2.2)), 0)
+    side = float(np.sqrt(spacing**2 + 4 - 2 * step**2))
+    box = int(side)
+    height, width = ((size - 1 - (box + 2)) // step + 1 for size in integral.shape)
+    share = ((box + 2) ** 2 - side**2) / ((box + 2) ** 2 - box**2)
+    return _Level(np.empty((height, width), np.float32), step, box, share)
+
+
+def describe(
+    integral: Int32[np.ndarray, "h1 w1"],
+    points: Float32[np.ndarray, "n 2"],
+    scales: Float32[np.ndarray, " n"],
+    num_parts: int,
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 64"]]:
+    """Return angles in radians and descriptors of key points at these scales (sigma, pixels)."""
+    angles = np.zeros(len(points), np.float32)
+    descriptors = np.empty((len(points), DESCRIPTOR_LENGTH), np.float32)
+    # OpenCV averages over a whole number of pixels a side
+    num_samples = PATCH_SIZE + 1
+    spacings = (np.floor(num_samples * scales) / num_samples).astype(np.float32)
+    level_idx = np.searchsorted(LEVEL_SPACINGS[:-1] * np.sqrt(LEVEL_RATIO), spacings)
+    used = np.unique(level_idx).tolist()
+    levels = {k: _empty_level(integral, float(LEVEL_SPACINGS[k])) for k in used}
+
+    def bounds(length: int, part: int) -> tuple[int, int]:
+        return length * part // num_parts, length * (part + 1) // num_parts
+
+    def prepare_part(part: int, _: int) -> None:
+        for level in levels.values():
+            smoothed = level.pixels, *bounds(len(level.pixels), part)
+            _smooth_rows(integral, level.box, level.share, level.step, *smoothed)
+        rows = rows_by_y[slice(*bounds(len(points), part))]
+        _orient(integral, points, scales, rows, angles)
+
+    def describe_part(part: int, _: int) -> None:
+        for k, level in levels.items():
+            rows = rows_by_y[level_idx[rows_by_y] == k]
+            rows, offset = rows[slice(*bounds(len(rows), part))], (level.box + 1) / 2
+            given = points, spacings, angles, rows, descriptors
+            _describe_rows(level.pixels, offset, level.step, *given)
+
+    # From the top of the image down, so that the reads of a thread stay in its core's cache.
+    rows_by_y = np.argsort(points[:, 1], kind="stable")
+    parallel_for_rows(prepare_part, num_parts, num_parts)
+    parallel_for_rows(describe_part, num_parts, num_parts)
+    return angles, descriptors
+
+
 @kernel(fastmath=True, error_model="numpy")
-def smooth_rows(integral, box, share, step, level, first, last):
+def _smooth_rows(integral, box, share, step, level, first, last):
     """Write rows [first, last) of `level`. Each pixel, at every step-th image pixel, mixes two
     means: `share` of the mean over box x box, and the rest over a box of side box + 2.
 
@@ -171,7 +245,7 @@ def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
 
 
 @kernel(error_model="numpy")
-def orient(integral, points, scales, rows, angles):
+def _orient(integral, points, scales, rows, angles):
     """Fill angles[rows] for the key points at points[rows] (x, y) with scales[rows]."""
     num_samples, num_sectors = ORIENTATION_SAMPLES.shape[1], 360 // SECTOR_DEG
     corners, sectors = np.empty(num_samples, np.int32), np.empty(num_samples, np.int32)
@@ -246,7 +320,7 @@ def _describe_patch(patch, sums, descriptor):
 
 
 @kernel(error_model="numpy")
-def describe(level, offset, level_step, points, spacings, angles, rows, descriptors):
+def _describe_rows(level, offset, level_step, points, spacings, angles, rows, descriptors):
     """Fill descriptors[rows] from one level of the pyramid, whose pixel (0, 0) is at (offset,
     offset) of the image."""
     side = PATCH_SIZE + 1
