@@ -3,8 +3,13 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from topoloc.features.features import MatchingConfig
-from topoloc.features.matching import Matcher, find_similar_pairs, match_features, match_pooled
-from topoloc.features.matching_kernels import TILE
+from topoloc.features.matching import (
+    TILE,
+    Matcher,
+    find_similar_pairs,
+    match_features,
+    match_pooled,
+)
 
 
 def unit(rows: np.ndarray) -> np.ndarray:

@@ -3,6 +3,10 @@
 `exact` compares all pairs with one matrix product. `flann` is the paper's method: randomised
 KD-trees ("FLANN-based matching", section III-B). Descriptors must have unit length, so that
 distance^2 = 2 - 2 product.
+
+The product does not use a BLAS. A threaded BLAS waits for its threads in a busy loop. Beside
+another busy program each call then costs a time slice of the scheduler, some 15 ms. The kernel is
+about as fast as a BLAS on one thread.
 """
 
 from __future__ import annotations
@@ -13,17 +17,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
-from topoloc.compiled import parallel_for_rows
+from topoloc.compiled import kernel, parallel_for_rows
 from topoloc.features.features import Matches, MatchingConfig
-from topoloc.features.matching_kernels import (
-    GROUP,
-    ROWS,
-    TILE,
-    find_nearest,
-    find_similar,
-    largest_products,
-)
 
+# Columns of a block of train descriptors, which stays in the first-level cache. With a power of
+# two, rows would share its lines.
+TILE = 96
+ROWS = 2  # query rows processed together; with GROUP components they fit into the registers
+GROUP = 4
+# A multiple of ROWS. Their products are read again while they are still in the cache.
+ROWS_AT_ONCE = 32
 _LOWE_RATIO = 0.8
 _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # the nearest of these that is not a duplicate is the rival
@@ -68,7 +71,7 @@ def find_similar_pairs(
     if not len(few) or not len(many):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     packed = _packed(few)  # only the few are packed, so that the many need not be rearranged
-    found = find_similar(_padded(many, packed), packed, len(few), np.float32(min_similarity))
+    found = _find_similar(_padded(many, packed), packed, len(few), np.float32(min_similarity))
     found = found[np.argsort(found[:, 1], kind="stable")]
     return found[:, 1], found[:, 0]
 
@@ -82,7 +85,7 @@ def largest_similarities(
 
     def run(first_group: int, last_group: int) -> None:
         for row in range(first_group, last_group):
-            largest_products(_padded(groups[row], packed), packed, largest[row])
+            _largest_products(_padded(groups[row], packed), packed, largest[row])
 
     parallel_for_rows(run, len(groups))
     return largest
@@ -144,7 +147,7 @@ class Matcher:
         def run(first_pair: int, last_pair: int) -> None:
             rows = slice(ROWS * first_pair, ROWS * last_pair)
             band_maximum = np.full_like(self._column_largest, -np.inf)
-            find_nearest(
+            _find_nearest(
                 padded[rows], self._packed, len(self._train), *compared, train_idx[rows], products[rows], band_maximum  # noqa: E501
             )  # fmt: skip
             band_maxima.append(band_maximum)
@@ -214,7 +217,7 @@ def _matches(
 def _padded(
     query: Float32[np.ndarray, "n d"], packed: Float32[np.ndarray, "tiles groups width"]
 ) -> Float32[np.ndarray, "n2 d2"]:
-    """Pad descriptors with zeros to whole groups of rows and components, as `multiply` requires
+    """Pad descriptors with zeros to whole groups of rows and components, as `_multiply` requires
     beside `packed`."""
     padded = np.zeros((-(-len(query) // ROWS) * ROWS, GROUP * packed.shape[1]), np.float32)
     padded[: len(query), : query.shape[1]] = query
@@ -229,3 +232,148 @@ def _packed(train: Float32[np.ndarray, "m d"]) -> Float32[np.ndarray, "tiles gro
     padded[: len(train), : train.shape[1]] = train
     tiles = padded.reshape(num_tiles, TILE, num_groups, GROUP).transpose(0, 2, 3, 1)
     return np.ascontiguousarray(tiles).reshape(num_tiles, num_groups, GROUP * TILE)
+
+
+@kernel(fastmath={"contract"})
+def _multiply(query, packed, out):
+    """Compute out[i, j] = query[i] . train[j]. The number of query rows must be a multiple of ROWS.
+    `packed` comes from `_packed`."""
+    sums = np.empty(ROWS * TILE, np.float32)
+    for tile in range(packed.shape[0]):
+        for i in range(0, query.shape[0] - ROWS + 1, ROWS):
+            sums[:] = np.float32(0.0)
+            a, b = query[i], query[i + 1]
+            for k in range(packed.shape[1]):
+                t = packed[tile, k]
+                a0, a1, a2, a3 = a[4 * k], a[4 * k + 1], a[4 * k + 2], a[4 * k + 3]
+                b0, b1, b2, b3 = b[4 * k], b[4 * k + 1], b[4 * k + 2], b[4 * k + 3]
+                for j in range(TILE):
+                    t0, t1, t2, t3 = t[j], t[TILE + j], t[2 * TILE + j], t[3 * TILE + j]
+                    sums[j] = sums[j] + a0 * t0 + a1 * t1 + a2 * t2 + a3 * t3
+                    sums[TILE + j] = sums[TILE + j] + b0 * t0 + b1 * t1 + b2 * t2 + b3 * t3
+            for row in range(ROWS):
+                for j in range(TILE):
+                    out[i + row, tile * TILE + j] = sums[row * TILE + j]
+
+
+@kernel()
+def _find_similar(query, packed, num_columns, least):
+    """Return (row, column) of all products of at least `least`, an array (k, 2).
+
+    `query` and `packed` are those of `_multiply`. Columns from `num_columns` on are ignored.
+    """
+    products = np.empty((ROWS, TILE * packed.shape[0]), np.float32)
+    found, count = np.empty((1024, 2), np.int64), 0
+    for i in range(0, query.shape[0] - ROWS + 1, ROWS):
+        _multiply(query[i : i + ROWS], packed, products)
+        for row in range(ROWS):
+            total = np.int32(0)
+            for column in range(num_columns):  # without branches, so that the loop vectorises
+                total += np.int32(products[row, column] >= least)
+            if total == 0:
+                continue
+            while count + total > found.shape[0]:
+                found = np.concatenate((found, np.empty_like(found)))
+            for column in range(num_columns):
+                if products[row, column] >= least:
+                    found[count, 0] = i + row
+                    found[count, 1] = column
+                    count += 1
+    return found[:count]
+
+
+@kernel()
+def _largest_products(rows, packed, out):
+    """Raise out[column] to the largest product of a row with it. `rows` and `packed` are `query`
+    and `packed` of `_multiply`."""
+    products = np.empty((ROWS, TILE * packed.shape[0]), np.float32)
+    for i in range(0, rows.shape[0] - ROWS + 1, ROWS):
+        _multiply(rows[i : i + ROWS], packed, products)
+        for row in range(ROWS):
+            for column in range(len(out)):
+                product = products[row, column]
+                out[column] = product if product > out[column] else out[column]
+
+
+@kernel()
+def _are_duplicates(points, radii, a, b):
+    squared = np.float32(0.0)
+    for axis in range(3):
+        squared += (points[a, axis] - points[b, axis]) ** 2
+    return squared <= max(radii[a], radii[b]) ** 2
+
+
+@kernel()
+def _find_nearest(
+    query, packed, num_columns, ratio, points, radii, out_winner, out_product, column_largest
+):
+    """Write the column of the largest product of each query row (the first of equal ones) and that
+    product.
+
+    The column is -1 if the winner fails the ratio test or if no product is comparable (NaN).
+    `query` and `packed` are those of `_multiply`. Columns from `num_columns` on are ignored.
+
+    Column k belongs to the map point `points[k]`. Columns within `radii` of the winner's point are
+    duplicates and not rivals. Without points (0, 3), every other column is a rival. A ratio of 0
+    disables the test. The length of `out_winner` is the number of query rows. `column_largest` is
+    updated with the largest product of each column.
+    """
+    table = np.empty((ROWS_AT_ONCE, TILE * packed.shape[0]), np.float32)
+    lanes = np.empty(TILE, np.float32)
+    for start in range(0, query.shape[0], ROWS_AT_ONCE):
+        stop = min(start + ROWS_AT_ONCE, query.shape[0])
+        _multiply(query[start:stop], packed, table)
+        for k in range(min(stop, len(out_winner)) - start):
+            row = table[k]
+            row[num_columns:] = -np.inf  # so that whole tiles can be searched
+            best = _row_maximum(row, lanes, column_largest)
+            out_product[start + k] = best
+            out_winner[start + k] = (
+                -1 if best == -np.inf else _find_unambiguous(row, lanes, best, ratio, points, radii)
+            )
+
+
+@kernel()
+def _row_maximum(row, lanes, column_largest):
+    """Return the maximum of whole tiles of products. NaN is ignored. `lanes[j]` becomes the maximum
+    over column j of all tiles."""
+    lanes[:] = -np.inf
+    for tile in range(len(row) // TILE):
+        part = row[tile * TILE : (tile + 1) * TILE]
+        above = column_largest[tile * TILE : (tile + 1) * TILE]
+        for j in range(TILE):  # each lane by itself, so that the loop vectorises
+            lanes[j] = part[j] if part[j] > lanes[j] else lanes[j]
+        for j in range(TILE):
+            above[j] = part[j] if part[j] > above[j] else above[j]
+    best = lanes[0]
+    for j in range(1, TILE):
+        best = max(best, lanes[j])
+    return best
+
+
+@kernel()
+def _find_unambiguous(row, lanes, best, ratio, points, radii):
+    """Return the first column with the largest product, or -1 if it has a rival. Only lanes that
+    can hold such columns are searched."""
+    winner = len(row)
+    for j in range(TILE):
+        if lanes[j] == best:
+            for column in range(j, winner, TILE):
+                if row[column] == best:
+                    winner = column
+                    break
+    if ratio <= 0.0:
+        return winner
+    # d1 < ratio * d2 with d^2 = 2 - 2 product. A rival reaches this product. Rounding may raise
+    # `best` above 1.
+    limit = min(best, np.float32(1.0 - (1.0 - best) / ratio**2))
+    for j in range(TILE):
+        if lanes[j] >= limit:
+            for column in range(j, len(row), TILE):
+                if (
+                    row[column] >= limit
+                    and column != winner
+                    and (len(points) == 0 or not _are_duplicates(points, radii, winner, column))
+                ):
+                    return -1
+    return winner
