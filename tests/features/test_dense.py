@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.features.learned import SingleLevelDescriptors, TwoLevelDescriptors
+from topoloc.features.dense import SingleLevelDescriptors, TwoLevelDescriptors
 
 STRIDE = 4.0
 

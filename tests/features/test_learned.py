@@ -10,13 +10,9 @@ import pytest
 from tiny_network import STRIDE, cells, write_network
 from topoloc.errors import WeightsError
 from topoloc.features import learned
+from topoloc.features.dense import SingleLevelDescriptors
 from topoloc.features.feature_types import check_available, default_learned_type
-from topoloc.features.learned import (
-    SingleLevelDescriptors,
-    extract_learned,
-    run_network,
-)
-from topoloc.features.learned_kernels import find_maxima, refine_subpixel, sample_descriptors
+from topoloc.features.learned import extract_learned, find_maxima, refine_subpixel, run_network
 
 CONFIG = ("xfeat", 64, 1000, 0.05)
 
@@ -135,7 +131,7 @@ def test_descriptors_are_bilinear_and_of_unit_length():
     dense = rng.normal(size=(16, 5, 7)).astype(np.float32)
     points = (rng.random((200, 2)) * (7 * STRIDE - 1, 5 * STRIDE - 1)).astype(np.float32)
     points[:4] = [(0, 0), (55, 39), (0, 39), (3.5, 3.5)]
-    found = sample_descriptors(dense, points, np.float32(STRIDE))
+    found = SingleLevelDescriptors(dense, float(STRIDE)).sample(points)
     np.testing.assert_allclose(
         found, _bilinear(dense.astype(np.float64), points.astype(np.float64), STRIDE), atol=1e-5
     )

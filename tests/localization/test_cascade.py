@@ -18,9 +18,9 @@ from room_stream import room_stream
 from tiny_network import write_network
 from tiny_world import CAMERA
 from topoloc.errors import FeatureTypeError, WeightsError
+from topoloc.features.dense import GridDescriptors, SingleLevelDescriptors
 from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.learned import GridDescriptors, SingleLevelDescriptors
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.calibration_check import CalibrationMismatch
 from topoloc.geometry.joint_camera.camera_hypotheses import (

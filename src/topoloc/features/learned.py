@@ -12,110 +12,20 @@ from __future__ import annotations
 
 import functools
 import os
-from abc import abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
-from topoloc import compiled
+from topoloc.compiled import kernel, num_threads as default_num_threads
 from topoloc.errors import WeightsError
-from topoloc.features.features import DenseDescriptors, Features
-from topoloc.features.learned_kernels import (
-    combine_levels,
-    find_maxima,
-    is_local_best_match,
-    normalize_descriptors,
-    refine_subpixel,
-    sample_descriptors,
-    sample_levels,
-)
+from topoloc.features.dense import GridDescriptors, SingleLevelDescriptors, TwoLevelDescriptors
+from topoloc.features.features import Features
 from topoloc.features.network_files import NetworkInfo, open_network
 
-_RADIUS = 4  # grid steps to each side in which the most similar descriptor is searched
-
-
-class GridDescriptors(DenseDescriptors):
-    """Hold one descriptor every `stride_px` pixels. The descriptor of pixel (x, y) lies at column
-    (x + 0.5) / stride_px - 0.5, and rows likewise.
-
-    A key point supports a pose only if it is detected again. In rain or at night most key points
-    are not. Dense descriptors need no detection. If a pose is right, the most similar descriptor
-    around a map point's projection lies at the projection itself.
-    """
-
-    @cached_property
-    @abstractmethod
-    def grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        """Return the whole grid with descriptors of unit length."""
-
-    def check_agreement(
-        self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]
-    ) -> Bool[np.ndarray, " n"]:
-        """Return for each point whether its best match lies at its projection.
-
-        The most similar descriptor is searched within 4 grid steps to each side. It must lie at
-        most one grid step from the point.
-        """
-        points_img, stride_px = points_img.astype(np.float32), np.float32(self.stride_px)
-        return is_local_best_match(self.grid, points_img, descriptors, stride_px, _RADIUS)
-
-
-@dataclass(frozen=True, eq=False)
-class SingleLevelDescriptors(GridDescriptors):
-    """Hold the output of most networks: one plane per component, not of unit length."""
-
-    planes: Float32[np.ndarray, "d rows columns"]
-    stride_px: float
-
-    @property
-    def size(self) -> int:
-        """Return the length of a descriptor."""
-        return self.planes.shape[0]
-
-    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
-        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
-        return sample_descriptors(self.planes, points_img, np.float32(self.stride_px))
-
-    @cached_property
-    def grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        """Return the whole grid with descriptors of unit length."""
-        return normalize_descriptors(self.planes)
-
-
-@dataclass(frozen=True, eq=False)
-class TwoLevelDescriptors(GridDescriptors):
-    """Hold two levels whose sum is the descriptors: `coarse`, enlarged bilinearly to twice its rows
-    and columns, and `fine` times `weights`.
-
-    Both operations are linear, and few descriptors of the grid are sampled. So the sum is computed
-    only at the sampled points.
-    """
-
-    coarse: Float32[np.ndarray, "half_rows half_columns d"]
-    fine: Float32[np.ndarray, "rows columns k"]
-    weights: Float32[np.ndarray, "k d"]
-    stride_px: float
-
-    @property
-    def size(self) -> int:
-        """Return the length of a descriptor."""
-        return self.coarse.shape[2]
-
-    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
-        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
-        levels = self.coarse, self.fine, self.weights
-        return sample_levels(*levels, points_img, np.float32(self.stride_px))
-
-    @cached_property
-    def grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        """Return the whole grid with descriptors of unit length."""
-        return combine_levels(self.coarse, self.fine, self.weights)
-
-
+_RADIUS = 2  # pixels to each side that a maximum exceeds
 _SIDE_MULTIPLE = 32
 _BORDER_PX = 4
 _CELLS = (4, 6)  # rows and columns of image cells, for image retrieval
@@ -197,7 +107,7 @@ def run_network(
     height, width = image.shape
     padding = np.array([(0, -side % _SIDE_MULTIPLE) for side in (height, width)])
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
-    number, path = num_threads or compiled.num_threads(), NetworkInfo.of_name(network).find_file()
+    number, path = num_threads or default_num_threads(), NetworkInfo.of_name(network).find_file()
     session = _session_for_size(network, path, number, grey.shape, os.getpid())
     names = [output.name for output in session.get_outputs()]
     outputs = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
@@ -229,3 +139,92 @@ def _session_for_size(
 def close_networks() -> None:
     """Close all open networks. They are opened again when needed."""
     _session_for_size.cache_clear()
+
+
+@kernel()
+def find_maxima(scores, height, width, border, min_score):
+    """Return the local maxima of the scores as pixels (x, y), row by row, and their scores.
+
+    A maximum exceeds `min_score` and all other scores within two pixels. Of equal scores the first
+    one counts. The image has `height` rows and `width` columns. The padded scores may have more.
+    """
+    most = height * width // 9 + 1
+    pixels, found = np.empty((most, 2), np.int32), np.empty(most, np.float32)
+    border = max(border, _RADIUS)
+    count, num_columns = 0, max(width - 2 * border, 0)
+    # Maxima along the window of each row, for as many rows as a window has.
+    along = np.empty((2 * _RADIUS + 1, num_columns), np.float32)
+    around = np.empty(num_columns, np.float32)
+    for y in range(border - _RADIUS, min(height - border + _RADIUS, height) if num_columns else 0):
+        _max_along_windows(scores[y], border, along[y % len(along)])
+        middle = y - _RADIUS
+        if middle < border:
+            continue
+        _max_over_rows(along, around)
+        row = scores[middle][border : border + num_columns]
+        for x in range(num_columns):
+            is_maximum = row[x] >= around[x] and row[x] > min_score
+            if is_maximum and _is_first_maximum(scores, middle, border + x):
+                pixels[count, 0], pixels[count, 1], found[count] = border + x, middle, row[x]
+                count += 1
+    return pixels[:count].copy(), found[:count].copy()
+
+
+@kernel()
+def _max_along_windows(row, border, out):
+    """Write the maximum score within two pixels along a row, for each pixel from `border` on."""
+    n = len(out)
+    a, b = row[border - 2 : border - 2 + n], row[border - 1 : border - 1 + n]
+    c = row[border : border + n]
+    d, e = row[border + 1 : border + 1 + n], row[border + 2 : border + 2 + n]
+    for x in range(n):  # without branches, so that the loop vectorises
+        left = a[x] if a[x] > b[x] else b[x]
+        right = d[x] if d[x] > e[x] else e[x]
+        beside = left if left > right else right
+        out[x] = c[x] if c[x] > beside else beside
+
+
+@kernel()
+def _max_over_rows(rows, out):
+    a, b, c, d, e = rows[0], rows[1], rows[2], rows[3], rows[4]
+    for x in range(len(out)):
+        above = a[x] if a[x] > b[x] else b[x]
+        below = c[x] if c[x] > d[x] else d[x]
+        both = above if above > below else below
+        out[x] = e[x] if e[x] > both else both
+
+
+@kernel()
+def _is_first_maximum(scores, y, x):
+    """Return whether no earlier pixel within two pixels has an equal score. No pixel in this window
+    may exceed the score."""
+    score = scores[y, x]
+    for v in range(y - _RADIUS, y + 1):
+        for u in range(x - _RADIUS, x + _RADIUS + 1):
+            if scores[v, u] == score and (v < y or u < x):
+                return False
+    return True
+
+
+@kernel()
+def refine_subpixel(scores, pixels):
+    """Return pixels (x, y) moved to the vertex of a parabola through the scores of each pixel and
+    its neighbours."""
+    points = np.empty((len(pixels), 2), np.float32)
+    for k in range(len(pixels)):
+        x, y = pixels[k, 0], pixels[k, 1]
+        points[k, 0] = x + _parabola_vertex(scores[y, x - 1], scores[y, x], scores[y, x + 1])
+        points[k, 1] = y + _parabola_vertex(scores[y - 1, x], scores[y, x], scores[y + 1, x])
+    return points
+
+
+@kernel()
+def _parabola_vertex(before, here, after):
+    """Return the vertex of the parabola through the logarithms of three scores at -1, 0 and 1. It
+    is limited to half a pixel."""
+    least = np.float32(1e-6)
+    a, b, c = np.log(before + least), np.log(here + least), np.log(after + least)
+    bend = a - 2 * b + c
+    if bend > -1e-6:
+        return np.float32(0.0)
+    return np.float32(min(max(0.5 * (a - c) / bend, -0.5), 0.5))

@@ -3,7 +3,7 @@
 Both rewritings concern linear parts. A normalisation after a sum of convolutions becomes a part of
 their weights. If descriptors are a sum of an enlarged coarse level and a 1x1 convolution of a fine
 one, the graph returns the two levels instead of the sum
-(`topoloc.features.learned.TwoLevelDescriptors`). The sum at a thousand key points costs next to
+(`topoloc.features.dense.TwoLevelDescriptors`). The sum at a thousand key points costs next to
 nothing. At all pixels it costs a tenth of the network.
 """
 
