@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -109,37 +110,37 @@ class Camera(OneLine):
     def _param(self, name: str) -> float:
         return dict(zip(MODELS[self.model], self.params, strict=True)).get(name, 0.0)
 
-    @property
+    @cached_property
     def fx(self) -> float:
         """Return the horizontal focal length, pixels."""
         return self._param("f" if "f" in MODELS[self.model] else "fx")
 
-    @property
+    @cached_property
     def fy(self) -> float:
         """Return the vertical focal length, pixels."""
         return self._param("f" if "f" in MODELS[self.model] else "fy")
 
-    @property
+    @cached_property
     def cx(self) -> float:
         """Return the x coordinate of the principal point, pixels."""
         return self._param("cx")
 
-    @property
+    @cached_property
     def cy(self) -> float:
         """Return the y coordinate of the principal point, pixels."""
         return self._param("cy")
 
-    @property
+    @cached_property
     def intrinsics(self) -> tuple[float, float, float, float]:
         """Return (fx, fy, cx, cy), pixels."""
         return self.fx, self.fy, self.cx, self.cy
 
-    @property
+    @cached_property
     def is_fisheye(self) -> bool:
         """Return whether the model is OpenCV's fisheye, with any number of its coefficients."""
         return self.model.endswith("FISHEYE")
 
-    @property
+    @cached_property
     def is_distorted(self) -> bool:
         """Return whether the camera is not a plain pinhole. A fisheye camera is always distorted,
         whatever its coefficients."""
@@ -211,7 +212,7 @@ class Camera(OneLine):
         """Return the pinhole camera with the same matrix and size."""
         return Camera.pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
-    @property
+    @cached_property
     def radius_scale(self) -> float:
         """Return the factor of a radius that is meant for images of 640 pixels, at least 0.5."""
         return max(max(self.width, self.height) / 640.0, 0.5)
