@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.absolute_pose import (
+    AbsolutePoseConfig,
+    compute_variance_inflation,
+    estimate_absolute_pose,
+)
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)

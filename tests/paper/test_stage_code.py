@@ -87,7 +87,7 @@ def _done_again(change: Callable[[], object]) -> set[str]:
     [
         ("topoloc/localization/localizer.py", ASKING),
         ("topoloc/localization/evidence.py", ASKING),
-        ("topoloc/geometry/absolute_pose_kernels.py", ASKING),
+        ("topoloc/geometry/pose_matches.py", ASKING),
         ("topoloc/tracking/tracker.py", set()),
         ("topoloc/slam/odometry.py", set()),
         ("topoloc/evaluation/metrics.py", set()),

@@ -5,6 +5,12 @@ https://github.com/PoseLib/PoseLib). It uses PROSAC ordering (Chum and Matas, 20
 are given. A robust refinement then weighs each match by the uncertainty of its pixel and of its
 point. `method="opencv"` is the paper's method, section III-B: OpenCV's RANSAC with EPnP and
 Levenberg-Marquardt refinement on the inliers.
+
+The covariance assumes independent errors. If a chair was moved or the depth of a wall is wrong, the
+errors of all its points pull the pose in one direction. Then the summed gradient of an image cell
+is larger than that of independent errors. The inflation is the ratio of two covariances of the
+pose: the clustered "sandwich" and the plain one (Liang and Zeger, *Longitudinal data analysis using
+generalized linear models*, 1986).
 """
 
 from __future__ import annotations
@@ -15,18 +21,17 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 import poselib
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from topoloc.bounds import Above, Between
-from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.pose_matches import (
+    CAUCHY_SCALE,
     MIN_POINTS,
     PoseMatches,
-    estimate_pose_covariance,
-    is_non_collinear,
-    refine_pose,
+    cells_of,
+    score_gradients,
 )
 from topoloc.geometry.rigid import Rigid3
 
@@ -34,6 +39,7 @@ MAX_THRESHOLD_SCALE = 3.0
 # OpenCV would need a second for the iterations that PoseLib runs in milliseconds.
 _OPENCV_MAX_ITERATIONS = 1000
 _OPENCV_CONFIDENCE = 0.99  # its default
+_MIN_CELLS = 6  # with fewer occupied cells no inflation is estimated
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,12 @@ class AbsolutePoseConfig:
     def key_point_sigma_px(self) -> float:
         """Return `sigma_px`, or one pixel if it is unset."""
         return 1.0 if self.sigma_px is None else self.sigma_px
+
+    @property
+    def inlier_limits(self) -> tuple[float, float]:
+        """Return the inlier threshold in pixels, and how many times uncertain points widen it."""
+        max_scale = 1.0 if self.method == "opencv" else MAX_THRESHOLD_SCALE
+        return self.max_reprojection_error_px, max_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,25 +132,21 @@ def estimate_absolute_pose(
     matches = PoseMatches.from_pixels(
         pixels, points_world[order], covariances, camera, sigma_px, normalized[order]
     )
-    if not is_non_collinear(matches.points_world) or not is_non_collinear(
-        np.insert(matches.normalized, 2, 0.0, axis=1)
-    ):
+    if not matches.can_fix_pose():
         return None
-    # The solvers get a pinhole of the same focal length and undistorted pixels. So thresholds keep
-    # their meaning and all camera models work alike. PoseLib adds no half pixel of its own.
-    undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    if start is None and config.method == "opencv":
-        cam_from_world = _solve_with_opencv(undistorted, matches.points_world, camera, config)
-    else:
-        if start is None:
-            start, *_ = estimate_pose_ransac(
-                undistorted, matches.points_world, camera, config, priorities is not None
-            ) or (None,)
-        cam_from_world = start and _refine_on_inliers(start, matches, camera, config)
-    if cam_from_world is None:
-        return None
-    active = select_inliers(cam_from_world, matches, camera, config)
-    return _with_covariance(cam_from_world, matches, active, order, len(points_img))
+    num_rounds = 2
+    if start is None:
+        # The solvers get a pinhole of the same focal length and undistorted pixels. So thresholds
+        # keep their meaning and all camera models work alike. PoseLib adds no half pixel of its
+        # own.
+        undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        solved = undistorted, matches.points_world, camera, config
+        if config.method == "opencv":
+            start, num_rounds = _solve_with_opencv(*solved), 0
+        else:
+            start, *_ = estimate_pose_ransac(*solved, priorities is not None) or (None,)
+    found = start and matches.fit(start, camera, *config.inlier_limits, num_rounds)
+    return found and _pose_of_all(found, order, len(points_img))
 
 
 def refine_absolute_pose(
@@ -166,13 +174,20 @@ def refine_absolute_pose(
         sigmas_px[rows],
         normalized[rows],
     )
-    for _ in range(2):  # the second pass uses the inliers of the first
-        active = _reprojection_errors(start, matches, camera) <= max_error_px
-        if not is_non_collinear(matches.points_world[active]):
-            return None
-        start = refine_pose(start, matches, active)
-    active = _reprojection_errors(start, matches, camera) <= max_error_px
-    return _with_covariance(start, matches, active, rows, len(points_img), 0.1)
+    found = matches.fit(start, camera, max_error_px, min_noise_scale=0.1)
+    return found and _pose_of_all(found, rows, len(points_img))
+
+
+def _pose_of_all(
+    found: tuple[Rigid3, Bool[np.ndarray, " m"], Float[np.ndarray, "6 6"]],
+    rows: Int[np.ndarray, " m"],
+    num_points: int,
+) -> AbsolutePose:
+    """Return a pose fitted to these rows of the points, with the inliers among all points."""
+    cam_from_world, active, covariance = found
+    inliers = np.zeros(num_points, dtype=np.bool_)
+    inliers[rows] = active
+    return AbsolutePose(cam_from_world, inliers, covariance)
 
 
 def estimate_pose_ransac(
@@ -219,17 +234,6 @@ def estimate_pose_ransac(
     return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), int(ransac_info["num_inliers"]), loss
 
 
-def _refine_on_inliers(
-    cam_from_world: Rigid3, matches: PoseMatches, camera: Camera, config: AbsolutePoseConfig
-) -> Rigid3 | None:
-    for _ in range(2):  # the second pass uses the inliers of the first
-        inliers = select_inliers(cam_from_world, matches, camera, config)
-        if not is_non_collinear(matches.points_world[inliers]):
-            return None
-        cam_from_world = refine_pose(cam_from_world, matches, inliers)
-    return cam_from_world
-
-
 def _solve_with_opencv(
     undistorted: np.ndarray, points_world: np.ndarray, camera: Camera, config: AbsolutePoseConfig
 ) -> Rigid3 | None:
@@ -258,42 +262,50 @@ def _solve_with_opencv(
     return Rigid3(cv2.Rodrigues(rotation)[0], translation[:, 0].copy())
 
 
-def _with_covariance(
-    cam_from_world: Rigid3,
-    matches: PoseMatches,
-    active: Bool[np.ndarray, " m"],
-    order: np.ndarray,
-    num_points: int,
-    min_noise_scale: float = 1.0,
-) -> AbsolutePose | None:
-    covariance = estimate_pose_covariance(cam_from_world, matches, active, min_noise_scale)
-    if covariance is None:
-        return None
-    inliers = np.zeros(num_points, dtype=np.bool_)
-    inliers[order] = active
-    return AbsolutePose(cam_from_world, inliers, covariance)
-
-
 def select_inliers(
     cam_from_world: Rigid3, matches: PoseMatches, camera: Camera, config: AbsolutePoseConfig
 ) -> Bool[np.ndarray, " n"]:
     """Return the inliers of a pose. With poselib the threshold is widened for uncertain points."""
-    errors_px = _reprojection_errors(cam_from_world, matches, camera)
-    limit_px = config.max_reprojection_error_px
-    if config.method == "opencv" or len(matches.point_covariances) == 0:
-        return errors_px <= limit_px
-    # A plain threshold would truncate the errors of uncertain points, and the rest would look too
-    # precise.
-    squares = squared_errors(*matches.kernel_args(cam_from_world))
-    return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (
-        errors_px <= MAX_THRESHOLD_SCALE * limit_px
+    arguments = matches.kernel_args(cam_from_world)
+    return matches.select_inliers(arguments, camera, *config.inlier_limits)
+
+
+def compute_variance_inflation(
+    points_img: Float[np.ndarray, "n 2"],
+    points_world: Float[np.ndarray, "n 3"],
+    point_covariances: Float[np.ndarray, "n 3 3"],
+    camera: Camera,
+    cam_from_world: Rigid3,
+    sigma_px: float | Float[np.ndarray, " n"],
+) -> float:
+    """Return the ratio of the pose's variance to that under independent errors of the inliers. It
+    is averaged over the six directions and at least 1.
+
+    If the inliers lie in fewer than six image cells, the ratio is 1.
+
+    Args:
+        points_img: pixels of the inliers.
+        points_world: world points of the inliers (metres).
+        point_covariances: covariances of these points (m^2).
+        sigma_px: standard deviation of the pixels.
+    """
+    matches = PoseMatches.from_pixels(points_img, points_world, point_covariances, camera, sigma_px)
+    used, cells = np.unique(cells_of(points_img, camera.width, camera.height), return_inverse=True)
+    if len(used) < _MIN_CELLS:
+        return 1.0
+    information, gradients = score_gradients(*matches.kernel_args(cam_from_world), CAUCHY_SCALE)
+    if not (
+        np.isfinite(information).all() and np.linalg.matrix_rank(information, hermitian=True) == 6
+    ):
+        return 1.0
+    # The pose is fitted to the same matches, which makes the sums smaller.
+    fit_correction = len(used) / (len(used) - 3.0)
+    gradients -= gradients.mean(axis=0)
+    clustered = np.zeros((len(used), 6))
+    np.add.at(clustered, cells, gradients)
+    variance_alone, variance_together = (
+        np.trace(np.linalg.solve(information, each.T @ each)) for each in (gradients, clustered)
     )
-
-
-def _reprojection_errors(
-    cam_from_world: Rigid3, matches: PoseMatches, camera: Camera
-) -> Float[np.ndarray, " n"]:
-    """Return the errors in pixels: NaN, which is below no limit, for points behind the camera or
-    outside its field."""
-    projected = camera.img_from_cam(cam_from_world.apply(matches.points_world))
-    return np.linalg.norm(projected - matches.points_img, axis=1)
+    if variance_alone <= 0.0:
+        return 1.0
+    return max(1.0, float(fit_correction * variance_together / variance_alone))

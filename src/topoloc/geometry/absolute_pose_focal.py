@@ -23,7 +23,6 @@ from topoloc.geometry.absolute_pose import (
     estimate_pose_ransac,
     select_inliers,
 )
-from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky, squared_errors
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
@@ -42,7 +41,10 @@ from topoloc.geometry.pose_matches import (
     CAUCHY_SCALE,
     PoseMatches,
     is_non_collinear,
+    normal_equations,
     refine_pose,
+    solve_cholesky,
+    squared_errors,
 )
 from topoloc.geometry.rigid import Rigid3
 

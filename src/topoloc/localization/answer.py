@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.absolute_pose import compute_variance_inflation
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
-from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
 from topoloc.json_data import OneLine
 from topoloc.localization.belief import (

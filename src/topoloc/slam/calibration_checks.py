@@ -16,9 +16,8 @@ from jaxtyping import Float
 
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
-from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.pose_matches import PoseMatches
+from topoloc.geometry.pose_matches import PoseMatches, squared_errors
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import camera_from_intrinsics
 from topoloc.recordings.frame import StereoSequence

@@ -16,9 +16,12 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from topoloc.geometry.absolute_pose import AbsolutePose, refine_absolute_pose
+from topoloc.geometry.absolute_pose import (
+    AbsolutePose,
+    compute_variance_inflation,
+    refine_absolute_pose,
+)
 from topoloc.geometry.camera import Camera, UncalibratedCamera
-from topoloc.geometry.pose_matches import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.localization.answer import Answer, Finding, lead
 from topoloc.localization.belief import Belief, Hypothesis
