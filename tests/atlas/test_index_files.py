@@ -13,8 +13,8 @@ import pytest
 
 from topoloc.atlas import descriptor_shard, index_files
 from topoloc.atlas.descriptor_shard import DescriptorShard
-from topoloc.atlas.index import GlobalDescriptors
-from topoloc.atlas.index_files import OpenedIndex, open_index
+from topoloc.atlas.index import AtlasIndex, GlobalDescriptors
+from topoloc.atlas.index_files import open_index
 from topoloc.atlas.manifest import PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
@@ -42,7 +42,7 @@ class Campus:
                 .astype(np.float32)
             )
 
-    def open(self) -> OpenedIndex:
+    def open(self) -> AtlasIndex:
         vocabulary, tiles = shared_vocabulary("surf"), []
         assert vocabulary is not None
         for name, rows in sorted(self.vectors.items()):
@@ -75,7 +75,7 @@ class Campus:
             raise AtlasError("broken is damaged")
         return {"surf": self.vectors[tile.tile_id]}
 
-    def check(self, opened: OpenedIndex) -> None:
+    def check(self, opened: AtlasIndex) -> None:
         """Check that an image of one of its places finds each tile, with the right similarity."""
         for name, rows in self.vectors.items():
             asked = rows[7] + 0.03 * self.rng.standard_normal(128).astype(np.float32)
@@ -83,7 +83,7 @@ class Campus:
             best = {
                 other: float((of_other @ asked).max()) for other, of_other in self.vectors.items()
             }
-            ranked = opened.index.rank({"surf": asked}, 3)
+            ranked = opened.rank({"surf": asked}, 3)
             assert [one for one, _ in ranked] == sorted(best, key=lambda one: -best[one])[:3], name
             assert [likeness for _, likeness in ranked] == pytest.approx(
                 [best[one] for one, _ in ranked], abs=1e-3
@@ -160,7 +160,7 @@ def test_tiles_that_are_removed_or_replaced_are_not_named(campus: Campus):
     opened = campus.open()
     assert campus.read == ["t05"]
     campus.check(opened)
-    assert opened.index.rank({"surf": gone}, 1)[0][1] < 0.9
+    assert opened.rank({"surf": gone}, 1)[0][1] < 0.9
     for number in range(6, 10):
         del campus.vectors[f"t{number:02d}"]
     campus.check(campus.open())  # more than a quarter is gone
@@ -172,7 +172,7 @@ def test_only_tiles_in_the_given_set_are_ranked(campus: Campus):
     for among in ({"t01"}, {"t01", "t02", "t07"}, set(campus.vectors) - {"t04"}, set()):
         asked = campus.vectors["t04"][3]
         best = {name: float((campus.vectors[name] @ asked).max()) for name in among}
-        ranked = opened.index.rank({"surf": asked}, 2, among)
+        ranked = opened.rank({"surf": asked}, 2, among)
         assert [name for name, _ in ranked] == sorted(best, key=lambda one: -best[one])[:2]
 
 
@@ -208,6 +208,6 @@ def test_a_tile_that_cannot_be_read_is_a_problem_until_it_can(campus: Campus):
     campus.add("broken")
     opened = campus.open()
     assert opened.problems == {"broken": "broken is damaged"}
-    assert "broken" not in dict(opened.index.rank({"surf": campus.vectors["broken"][0]}, 99))
+    assert "broken" not in dict(opened.rank({"surf": campus.vectors["broken"][0]}, 99))
     assert campus.open().problems == opened.problems
     assert campus.read == ["broken"]

@@ -11,9 +11,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from topoloc.atlas.editing import find_other_facts
+from topoloc.atlas import editing
+from topoloc.atlas.editing import NewTile
 from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descriptors
-from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
+from topoloc.atlas.index_files import index_folder, open_index
 from topoloc.atlas.joint_worlds import Join
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
 from topoloc.atlas.store import MANIFEST, Store, find_store, read_manifest, sha256_of, store_at
@@ -68,9 +69,8 @@ class Atlas(OneLine):
             AtlasError: an atlas exists there, two tiles get one name, or it cannot be written.
             MapError: a map is missing, damaged or empty.
         """
-        from topoloc.atlas.editing import create_atlas, new_tiles
-
-        return Atlas(store_at(where), create_atlas(where, new_tiles(maps, tile_id, world)))
+        new = editing.new_tiles(maps, tile_id, world)
+        return Atlas(store_at(where), editing.create_atlas(where, new))
 
     @staticmethod
     def add(
@@ -82,9 +82,8 @@ class Atlas(OneLine):
     ) -> Atlas:
         """Add map files to the atlas there, as `create`; with `replaces` tiles of the same names
         are replaced. Raises AtlasError, MapError."""
-        from topoloc.atlas.editing import add_tiles, new_tiles
-
-        return Atlas(store_at(where), add_tiles(where, new_tiles(maps, tile_id, world), replaces))
+        new = editing.new_tiles(maps, tile_id, world)
+        return Atlas(store_at(where), editing.add_tiles(where, new, replaces))
 
     @staticmethod
     def add_map(
@@ -97,10 +96,8 @@ class Atlas(OneLine):
         Raises AtlasError if the atlas has a tile of the same id or cannot be written, MapError if
         the map is damaged or empty.
         """
-        from topoloc.atlas.editing import NewTile, add_tiles
-
         new = NewTile(tile_id, path, world, recipe)
-        return add_tiles(where, [new], replaces, creates=True).by_id[tile_id]
+        return editing.add_tiles(where, [new], replaces, creates=True).by_id[tile_id]
 
     @staticmethod
     def read_manifest(where: str) -> Manifest:
@@ -115,9 +112,7 @@ class Atlas(OneLine):
     @staticmethod
     def remove(where: str, tile_ids: Sequence[str]) -> Atlas:
         """Remove tiles from the atlas there. Raises AtlasError."""
-        from topoloc.atlas.editing import remove_tiles
-
-        return Atlas(store_at(where), remove_tiles(where, tile_ids))
+        return Atlas(store_at(where), editing.remove_tiles(where, tile_ids))
 
     @staticmethod
     def merge(sources: Sequence[str], where: str) -> Atlas:
@@ -129,8 +124,6 @@ class Atlas(OneLine):
         tile's file is missing or wrong, or the atlas cannot be written. Raises MapError if a map is
         missing, damaged or empty.
         """
-        from topoloc.atlas import editing
-
         store = store_at(where)
         if store.manifest() is not None:
             raise AtlasError(f"{where} is an atlas already; a merged one is new")
@@ -140,13 +133,12 @@ class Atlas(OneLine):
                 if (of_source := find_store(source)) is None:
                     (new,) = editing.new_tiles([source])
                     added = {new.tile_id: editing.store_tile(new, put)}
-                    editing.check_same_maps(source, tiles, added)
                 else:
                     atlas = Atlas(of_source, read_manifest(of_source)[1])
                     added = atlas.manifest.by_id
-                    editing.check_same_maps(source, tiles, added)
                     atlas._copy_files(put)
                     joins += atlas.manifest.joins
+                editing.check_same_maps(source, tiles, added)
                 tiles = editing.with_unique_worlds(tiles, added) | tiles
             after = Manifest().with_tiles(tiles, time.time(), joins)
             if not store.commit(None, after.to_bytes()):
@@ -192,8 +184,6 @@ class Atlas(OneLine):
         Raises AtlasError if there is no such atlas or tile, it cannot be read or written, or other
         writers replaced the tile in each of five tries.
         """
-        from topoloc.atlas.editing import NewTile, replace_tile
-
         where, max_tries = self.store.where, 5
         for _ in range(max_tries):
             atlas = Atlas.open(where)
@@ -212,7 +202,7 @@ class Atlas(OneLine):
                 if sha256_of(path) == before.map.sha256:
                     return done
                 new = NewTile(tile_id, path, before.world, before.recipe, before.previous[1:])
-                if replace_tile(where, new, before) is not None:
+                if editing.replace_tile(where, new, before) is not None:
                     return done
         raise AtlasError(
             f"{where}: tile {tile_id} was replaced by others {max_tries} times meanwhile; it stays"
@@ -258,7 +248,7 @@ class Atlas(OneLine):
             except AtlasError as error:
                 return str(error)
         try:
-            other = find_other_facts(tile, self.map_path(tile))
+            other = editing.find_other_facts(tile, self.map_path(tile))
         except MapError as error:
             return str(error)
         return f"{MANIFEST} differs from its map: {', '.join(other)}" if other else None
@@ -291,7 +281,8 @@ class Atlas(OneLine):
         return read_history(self.map_path(tile), len(tile.previous))
 
     @cached_property
-    def _opened(self) -> OpenedIndex:
+    def index(self) -> AtlasIndex:
+        """Return the index of all tiles with readable global descriptors."""
         return open_index(self.manifest.tiles, self.places_of, index_folder(self.store.where))
 
     def places_of(self, tile: Tile) -> GlobalDescriptors:
@@ -307,19 +298,3 @@ class Atlas(OneLine):
         if any(len(rows) != tile.num_nodes for rows in vectors.values()):
             raise AtlasError(f"{path} is damaged: the tile has {tile.num_nodes} nodes")
         return vectors
-
-    @property
-    def problems(self) -> dict[str, str]:
-        """Return the reason for each tile (by id) that cannot be ranked. These tiles are queried
-        last."""
-        return self._opened.problems
-
-    @property
-    def notes(self) -> list[str]:
-        """Return problems with the index files. The index works without these files."""
-        return self._opened.notes
-
-    @property
-    def index(self) -> AtlasIndex:
-        """Return the index of all tiles with readable global descriptors."""
-        return self._opened.index

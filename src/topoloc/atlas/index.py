@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,9 @@ class AtlasIndex:
         vectors: the global descriptors of each tile that are compared exactly.
         shards: further descriptors of these tiles (`descriptor_shard.py`). Each shard comes with
             the index in `tile_ids` of each of its tiles, -1 for tiles that are never returned.
+        problems: the reason for each tile (by id) that cannot be ranked. These tiles are queried
+            last.
+        notes: problems with the index files. The index works without these files.
     """
 
     def __init__(
@@ -114,8 +118,10 @@ class AtlasIndex:
         tile_ids: Sequence[str],
         vectors: Sequence[GlobalDescriptors],
         shards: Sequence[tuple[DescriptorShard, Sequence[int]]] = (),
+        problems: Mapping[str, str] = MappingProxyType({}),
+        notes: Sequence[str] = (),
     ) -> None:
-        self._tile_ids = list(tile_ids)
+        self._tile_ids, self.problems, self.notes = list(tile_ids), problems, notes
         self._by_kind: dict[str, list[_Rank]] = {}
         for kind in {kind for one in vectors for kind in one}:
             rows = [row for row, one in enumerate(vectors) if len(one.get(kind, ())) > 0]

@@ -38,15 +38,6 @@ _Rows = tuple[ShardTile, Float16[np.ndarray, "_ _"]]
 
 
 @dataclass(frozen=True, eq=False)
-class OpenedIndex:
-    """Hold the index, the reason for each tile (by id) that cannot be ranked, and file problems."""
-
-    index: AtlasIndex
-    problems: dict[str, str]
-    notes: list[str]
-
-
-@dataclass(frozen=True, eq=False)
 class _LiveShard:
     """Hold a shard and a mask of its current tiles."""
 
@@ -74,7 +65,7 @@ def index_folder(where: str) -> Path:
     return cache_folder() / "indexes" / hashlib.sha256(place.encode()).hexdigest()[:16]
 
 
-def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> OpenedIndex:
+def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> AtlasIndex:
     """Open the index of these tiles from the shards in `folder`. Missing shards are built, and
     stored there if it is writable.
 
@@ -103,8 +94,8 @@ def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> Op
     for one in chain.from_iterable(live_shards.values()):
         live = zip(one.shard.tiles, one.is_live, strict=True)
         shards.append((one.shard, [numbers[tile.tile_id] if is_ else -1 for tile, is_ in live]))
-    index = AtlasIndex(ids, [exact.get(tile_id, {}) for tile_id in ids], shards)
-    return OpenedIndex(index, work.problems, work.notes)
+    vectors = [exact.get(tile_id, {}) for tile_id in ids]
+    return AtlasIndex(ids, vectors, shards, work.problems, work.notes)
 
 
 @dataclass(eq=False)

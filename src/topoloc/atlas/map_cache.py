@@ -42,7 +42,6 @@ class OpenedMap(Protocol):
     @property
     def topomap(self) -> TopoMetricMap:
         """Return the map."""
-        ...
 
 
 M = TypeVar("M", bound=OpenedMap)

@@ -12,6 +12,7 @@ there: of two writers at once the last one wins, and temporary files of killed w
 
 from __future__ import annotations
 
+import glob
 import os
 import secrets
 import shutil
@@ -245,28 +246,21 @@ def _resolve_link(path: Path) -> Path:
 def remove_stale_files(path: Path) -> None:
     """Remove temporary files of `path` left by killed writers. Files of running processes stay."""
     path = _resolve_link(path)
-    prefix = _temporary_prefix(path)
-    try:
-        names = [name for name in os.listdir(path.parent) if name.startswith(prefix)]
-    except OSError:  # no such folder: the writer reports it
-        return
+    remove_all_stale_files(path.parent, _temporary_prefix(path))
+
+
+def remove_all_stale_files(folder: Path, prefix: str = ".") -> None:
+    """Remove temporary files of any target in a folder, left by killed writers. Files of running
+    processes stay. `prefix` is that of the files' names."""
+    names = sorted(path.name for path in folder.glob(f"{glob.escape(prefix)}*"))
     for name in names:
         if name.endswith(".part"):
-            _remove_unlocked(path.parent / name)
+            _remove_unlocked(folder / name)
     for name in names:  # journals of SQLite whose temporary file does not exist any more
         owner = name.removesuffix("-journal")
-        if owner != name and owner.endswith(".part") and not (path.parent / owner).exists():
+        if owner != name and owner.endswith(".part") and not (folder / owner).exists():
             with suppress(OSError):
-                (path.parent / name).unlink()
-
-
-def remove_all_stale_files(folder: Path) -> None:
-    """Remove temporary files of any target in a folder, left by killed writers. Files of running
-    processes stay."""
-    with suppress(OSError):
-        for name in os.listdir(folder):
-            if name.startswith(".") and name.endswith(".part"):
-                _remove_unlocked(folder / name)
+                (folder / name).unlink()
 
 
 def _temporary_prefix(path: Path) -> str:

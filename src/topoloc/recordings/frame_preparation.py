@@ -20,49 +20,14 @@ from topoloc.recordings.frame import DepthImage, Image, StereoFrame, to_grey
 
 
 @kernel(error_model="numpy")
-def back_project(depth, normalized, rotation, translation, points):
-    """Fill `points` (n, 3) with the points of known depth, in the other camera's frame. Return n.
-
-    `normalized` (h * w, 2) holds the pixels on the depth camera's plane z = 1. `points` has a row
-    for every pixel.
-    """
-    height, width = depth.shape
-    count = 0
-    for row in range(height):
-        for column in range(width):
-            z = np.float64(depth[row, column])
-            if not z > 0.0:  # NaN compares false
-                continue
-            x, y = normalized[row * width + column, 0] * z, normalized[row * width + column, 1] * z
-            for axis in range(3):
-                points[count, axis] = (
-                    rotation[axis, 0] * x
-                    + rotation[axis, 1] * y
-                    + rotation[axis, 2] * z
-                    + translation[axis]
-                )
-            count += 1
-    return count
-
-
-@kernel(error_model="numpy", inline="always")
-def _update_z_buffer_pixel(x, y, depth, registered):
-    height, width = registered.shape
-    if x >= -0.5 and y >= -0.5 and x < width - 0.5 and y < height - 0.5:
-        row, column = int(np.rint(y)), int(np.rint(x))
-        z = np.float32(depth)
-        if not registered[row, column] <= z:  # also true for NaN
-            registered[row, column] = z
-
-
-@kernel(error_model="numpy")
 def register_undistorted(depth, normalized, rotation, translation, focal, centre, registered):
-    """Register depth to a camera without distortion in one pass.
+    """Register depth to a camera without distortion in one pass, without storing points.
 
-    Combines `back_project`, the projection (focal lengths and principal point, x and y) and
-    `update_z_buffer` without storing points. The results are bit-identical.
+    `normalized` (h * w, 2) holds the pixels on the depth camera's plane z = 1, `focal` and `centre`
+    the focal lengths and the principal point (x and y) of the other camera. NaN marks pixels of
+    `registered` without depth.
     """
-    height, width = depth.shape
+    (height, width), (rows, columns) = depth.shape, registered.shape
     for row in range(height):
         for column in range(width):
             z = np.float64(depth[row, column])
@@ -72,18 +37,13 @@ def register_undistorted(depth, normalized, rotation, translation, focal, centre
             px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
             py = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
             pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
-            if pz > 1e-9:
-                _update_z_buffer_pixel(
-                    px / pz * focal[0] + centre[0], py / pz * focal[1] + centre[1], pz, registered
-                )
-
-
-@kernel(error_model="numpy")
-def update_z_buffer(pixels, points, registered):
-    """Write the z of each point to `registered` at its rounded pixel, if no nearer point is there.
-    NaN marks empty pixels."""
-    for i in range(len(pixels)):
-        _update_z_buffer_pixel(pixels[i, 0], pixels[i, 1], points[i, 2], registered)
+            if not pz > 1e-9:
+                continue
+            x, y = px / pz * focal[0] + centre[0], py / pz * focal[1] + centre[1]
+            if x >= -0.5 and y >= -0.5 and x < columns - 0.5 and y < rows - 0.5:
+                at = int(np.rint(y)), int(np.rint(x))
+                if not registered[at] <= np.float32(pz):  # also true for NaN
+                    registered[at] = np.float32(pz)
 
 
 _cached_rectify = lru_cache(maxsize=4)(rectify)
@@ -218,15 +178,20 @@ def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarra
         camera = camera.rescaled(*size)
     pose = depth_image.cam_from_depth
     normalized = _normalized_pixels(depth_image.camera, width, height)
-    arguments = depth_image.depth, normalized, pose.rotation, pose.translation
     registered = np.full((camera.height, camera.width), np.nan, np.float32)
     if not camera.is_distorted:
         focal, centre = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        register_undistorted(*arguments, focal, centre, registered)
+        motion = pose.rotation, pose.translation
+        register_undistorted(depth_image.depth, normalized, *motion, focal, centre, registered)
         return registered
-    points = np.empty((height * width, 3))
-    points = points[: back_project(*arguments, points)]
-    update_z_buffer(camera.img_from_cam(points), points, registered)
+    depth = depth_image.depth.reshape(-1, 1).astype(np.float64)
+    points = pose.apply(
+        (np.column_stack([normalized, np.ones_like(depth)]) * depth)[depth[:, 0] > 0]
+    )
+    columns, rows = np.rint(camera.img_from_cam(points)).T
+    inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+    pixels = rows[inside].astype(int), columns[inside].astype(int)
+    np.fmin.at(registered, pixels, points[inside, 2].astype(np.float32))  # the nearest point
     return registered
 
 

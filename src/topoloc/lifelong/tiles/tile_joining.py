@@ -247,7 +247,7 @@ def find_candidate_pairs(atlas: Atlas, wanted: Collection[str]) -> list[tuple[Ti
     manifest, index = atlas.manifest, atlas.index
     scores, known = dict[tuple[str, str], float](), {join.pair for join in manifest.joins}
     for tile in manifest.tiles:
-        if tile.tile_id not in wanted or tile.tile_id in atlas.problems:
+        if tile.tile_id not in wanted or tile.tile_id in index.problems:
             continue
         candidate_ids = [other.tile_id for other in manifest.tiles if _may_overlap(tile, other)]
         if not candidate_ids or not index.kinds:

@@ -63,10 +63,10 @@ class AtlasTiles(Tiles):
         self.atlas, self.config, self._maps, self._warn = atlas, config, maps, warn
         self.ids, self.problems = list(atlas.manifest.by_id), dict[str, str]()
         self._retry_times = dict[str, float]()
-        self.unranked = frozenset(atlas.problems)
-        for note in atlas.notes:
+        self.unranked = frozenset(atlas.index.problems)
+        for note in atlas.index.notes:
             warn(note)
-        for tile_id, problem in atlas.problems.items():
+        for tile_id, problem in atlas.index.problems.items():
             warn(f"tile {tile_id} is searched after all others: {problem}")
         self._focal = max(tile.focal_px for tile in atlas.manifest.tiles)
 
@@ -112,7 +112,9 @@ class AtlasTiles(Tiles):
             query_image.image, query_image.camera, self._focal, sizes.max_finer, sizes.max_side_px
         )
         unranked = [
-            (tile_id, 0.0) for tile_id in self.atlas.problems if reach is None or tile_id in reach
+            (tile_id, 0.0)
+            for tile_id in self.atlas.index.problems
+            if reach is None or tile_id in reach
         ]
         vectors, ranking = {}, TileRanking()
         for kind in self._ranking_feature_types:

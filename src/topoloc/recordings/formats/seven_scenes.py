@@ -89,11 +89,11 @@ def _read_pose(path: Path) -> Rigid3:
     """Read world_from_cam of the colour camera of one frame."""
     try:
         numbers = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64)
-        return Rigid3.from_matrix(numbers.reshape(4, 4)) @ COLOUR_FROM_DEPTH.inverse()
+        matrix = numbers.reshape(4, 4)
     except ValueError:
         raise TrajectoryError(f"{path}: not a matrix of 4x4 numbers") from None
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
+    with TrajectoryError.at(path):
+        return Rigid3.from_matrix(matrix) @ COLOUR_FROM_DEPTH.inverse()
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_seven_scenes)
