@@ -15,7 +15,7 @@ PREDICATE, ENGINE = "geometry/rigid.py", "geometry/transform_consensus.py"
 OTHER_TESTS = {"tracking/motion.py:_is_same_motion"}
 # It draws triples of points. `find_least_median` compares their transforms.
 OTHER_ENGINES = {
-    "mapping/georeferencing.py:_robust_weights",
+    "mapping/georeference_fit.py:_robust_weights",
     "apps/cli/maps/floor.py:_sample_normal",  # it searches a plane, no transform
 }
 _ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)

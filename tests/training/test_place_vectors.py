@@ -15,7 +15,7 @@ from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
 from topoloc.features.features import Features
 from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel, open_coarse_localizer
-from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
+from topoloc.retrieval.inference import NetworkDescriptorLocalizer
 from topoloc.retrieval.network_images import NetworkInputConfig, decode_stored_image
 from topoloc.retrieval.vlad_nn import VladNetwork
 from topoloc_training import cnn_nn, vlad_nn

@@ -192,10 +192,8 @@ def _opened(path: Path) -> DescriptorShard:
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ValueError("it is no index of places")
-        expected, digest = file.read(32), hashlib.sha256()
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-        if digest.digest() != expected:
+        expected = file.read(32)
+        if hashlib.file_digest(file, "sha256").digest() != expected:
             raise ValueError("its checksum is another")
         file.seek(len(_MAGIC) + 32)
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))

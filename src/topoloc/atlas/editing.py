@@ -103,7 +103,17 @@ def add_tiles(
     """
 
     def add(manifest: Manifest, added: dict[str, Tile], now: float) -> Manifest:
-        _check_ids_free(manifest, new, replaces)
+        taken = [
+            tile.tile_id
+            for tile in new
+            if (there := manifest.by_id.get(tile.tile_id)) is not None
+            and (tile.recipe is None or there.recipe != tile.recipe)
+        ]
+        if taken and not replaces:
+            raise AtlasError(
+                f"the atlas has a tile {taken[0]} already; --replace replaces it, --id gives the"
+                " new one another id"
+            )
         return manifest.with_tiles(manifest.by_id | added, now)
 
     return _store_and_commit(store_at(where), new, add, grace_s, creates)
@@ -247,20 +257,6 @@ def _store_file(put: PutFile, name: str, path: Path) -> StoredFile:
 
 class _TileChangedError(Exception):
     """Signal that another writer changed the tile first."""
-
-
-def _check_ids_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:
-    taken = [
-        tile.tile_id
-        for tile in new
-        if (there := manifest.by_id.get(tile.tile_id)) is not None
-        and (tile.recipe is None or there.recipe != tile.recipe)
-    ]
-    if taken and not replaces:
-        raise AtlasError(
-            f"the atlas has a tile {taken[0]} already; --replace replaces it, --id gives the new"
-            " one another id"
-        )
 
 
 def _commit_change(

@@ -14,7 +14,7 @@ from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.json_data import OneLine
 from topoloc.mapping.edit import WaitCallback, edit_map
-from topoloc.mapping.georeferencing import (
+from topoloc.mapping.georeference_fit import (
     GeoreferenceFit,
     estimate_up_direction,
     fit_georeference,

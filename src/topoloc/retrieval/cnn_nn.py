@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from topoloc.retrieval.backbones import Backbone
 from topoloc.retrieval.coarse import CoarseModel, read_setting
-from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
+from topoloc.retrieval.inference import NetworkDescriptorLocalizer
 from topoloc.retrieval.network_images import BackboneName, PooledNetworkConfig
 
 # Deeper layers describe objects more and places less. The fifth and sixth of SqueezeNet's fire

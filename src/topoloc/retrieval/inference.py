@@ -1,4 +1,5 @@
 """Run a trained network on single images and on batches, in the fastest way for this processor.
+Rank nodes by a network that computes global descriptors: cnn-nn and vlad-nn.
 
 If the processor multiplies bfloat16 in hardware, bfloat16 is used. Otherwise single precision is
 used, and a network for single images is frozen into TorchScript. Its fused calls save a third of a
@@ -9,19 +10,30 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 from torch import Tensor, nn
 
 from topoloc.compiled import num_threads
+from topoloc.errors import MapError
+from topoloc.features.features import Features
 from topoloc.retrieval.backbones import normalize_images
-from topoloc.retrieval.network_images import RgbImages
+from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, read_setting
+from topoloc.retrieval.descriptor_index import DescriptorIndex, Whitening
+from topoloc.retrieval.network_images import (
+    ImageShape,
+    NetworkInputConfig,
+    RgbImages,
+    prepare_network_images,
+)
 
 BATCH_SIZE = 16
+_CHUNK = 64  # images that are prepared for the network together
 
 
 def has_bfloat16() -> bool:
@@ -139,3 +151,65 @@ def load_network_weights(network: nn.Module, arrays: Mapping[str, np.ndarray]) -
     is_real = {name: value.is_floating_point() for name, value in state.items()}
     network.load_state_dict({k: v.float() if is_real[k] else v for k, v in state.items()})
     return network
+
+
+class NetworkDescriptorLocalizer:
+    """Implement the coarse localizers `cnn-nn` and `vlad-nn`.
+
+    Raises:
+        MapError: the model's arrays are inconsistent.
+    """
+
+    def __init__(
+        self, model: CoarseModel, network: nn.Module, input_config: NetworkInputConfig
+    ) -> None:
+        self._model, self._input_config = model, input_config
+        try:
+            self._shape = ImageShape(*read_setting(model, "picture_shape", tuple[int, int]))
+            self._predict = Predictor(load_network_weights(network, model.arrays))
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise MapError(
+                f"the map's coarse localizer {model.name!r} is damaged:"
+                f" {' '.join(str(error).split())[:200]}"
+            ) from error
+        mean = model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False)
+        projection = model_array(model, "projection", "f", (None, len(mean))).astype(np.float32)
+        vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
+        self._whitening = Whitening(mean, projection)
+        node_rows = model_array(model, "node_ids", "iu", (len(vectors),))
+        self._index = DescriptorIndex(vectors, node_rows)
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        """Rank nodes as in `CoarseLocalizer.rank`. Scores are cosines. The local features are not
+        used."""
+        return self._index.rank_nodes(self.vectors([image])[0], num_candidates)
+
+    def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
+        """Rank nodes for many images, which pass through the network together."""
+        return [self._index.rank_nodes(vector, num_candidates) for vector in self.vectors(images)]
+
+    def extend_with_images(
+        self, images: Sequence[Image], node_ids: Int[np.ndarray, " n"]
+    ) -> CoarseModel:
+        """Return the model extended by the descriptors of these images (see `ExtendableLocalizer`).
+        The whitening is unchanged."""
+        known = self._model.arrays
+        parts = [self.vectors(images[k : k + _CHUNK]) for k in range(0, len(images), _CHUNK)]
+        dtype = known["vectors"].dtype
+        vectors = np.concatenate([known["vectors"], *(part.astype(dtype) for part in parts)])
+        all_node_ids = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
+        return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": all_node_ids})
+
+    def vectors(self, images: Sequence[Image]) -> Float32[np.ndarray, "n d"]:
+        """Return the unit vectors of the images.
+
+        Raises:
+            MapError: the whitening does not fit the network.
+        """
+        raw = self._predict(prepare_network_images(images, self._shape, self._input_config))
+        if raw.shape[1] != len(self._whitening.mean):
+            raise MapError(
+                f"the map's coarse localizer {self._model.name!r} is damaged: its whitening is not"
+                " that of its network"
+            )
+        return self._whitening.apply(raw)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from topoloc.retrieval.backbones import Backbone
 from topoloc.retrieval.coarse import CoarseModel, read_setting
-from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
+from topoloc.retrieval.inference import NetworkDescriptorLocalizer
 from topoloc.retrieval.network_images import BackboneName, VladNetworkConfig
 
 # NetVLAD uses VGG's last convolution before its rectifier and pooling, like the public checkpoints.

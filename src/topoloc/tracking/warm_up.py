@@ -24,7 +24,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import count_consistent_displacements, match_projections
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
-from topoloc.localization.walls.place_comparison import estimate_upright_pose
+from topoloc.localization.walls.propose_virtual_views import estimate_upright_pose
 from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, MemorySequence, StereoFrame

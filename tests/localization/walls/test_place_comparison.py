@@ -8,7 +8,7 @@ from built_corridor import WIDE, corridor_of_two_kinds, seen_on_the_way_back
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import Deadline, QueryImage, StageClock
-from topoloc.localization.walls.place_comparison import Comparison
+from topoloc.localization.walls.propose_virtual_views import Comparison
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 
 

@@ -43,8 +43,7 @@ from topoloc.localization.walls import (
     propose_virtual_views as propose_walls_module,
     virtual_view_matching,
 )
-from topoloc.localization.walls.place_comparison import Comparison
-from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
+from topoloc.localization.walls.propose_virtual_views import Comparison, propose_virtual_views
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes
 
@@ -266,8 +265,8 @@ def test_an_inexact_place_is_tried_again_from_its_pose():
     assert search.map.walls is not None
     walls = VirtualViewSearch.of(search, search.map.walls)
     away = Rigid3(truth.rotation, truth.translation + np.array([0.0, 2.0, 0.0]))
-    from_there = propose_walls_module._propose(Comparison.of(walls, away))
-    from_here = propose_walls_module._propose(Comparison.of(walls, truth))
+    from_there = Comparison.of(walls, away).match_all()
+    from_here = Comparison.of(walls, truth).match_all()
     assert from_there is not None
     assert from_here is not None
     again = propose_walls_module._compare_again(from_there)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.walls.place_comparison import estimate_upright_pose
+from topoloc.localization.walls.propose_virtual_views import estimate_upright_pose
 
 NUM_POINTS, NODE_DEPTH = 60, 1.4
 

@@ -2,8 +2,15 @@
 
 This is the last source of proposals. The image's views to the left and right
 (`features/extraction.py`) are compared with the virtual views of the map. Candidate places come
-from `virtual_view_index.py`. A pose that matches of both views agree on (`place_comparison.py`) is
-refined in both together (`virtual_view_matching.py`).
+from `virtual_view_index.py`. A pose that matches of both views agree on is refined in both together
+(`virtual_view_matching.py`). Few strong features are matched first. All are matched if enough of
+these agree on one upright pose.
+
+PnP on matches with one wall is ambiguous. The points are coplanar, and a plane admits a second pose
+that looks nearly the same from the other slant. But people and robots carry cameras upright. Two
+such cameras differ by a rotation about the vertical and a translation, which two matches determine
+(Kukelova, Bujnak and Pajdla, 2010: pose of a camera with known vertical direction). The pose with
+the most agreeing matches is proposed. Its tilt is estimated later.
 
 Walls repeat, doors above all. So the evidence also counts the key points that match here better
 than anywhere else in the virtual views. Poses near nodes with the same viewing direction are
@@ -17,9 +24,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
-from topoloc.features.features import MatchingConfig
-from topoloc.features.matching import match_features
+from topoloc.features.features import Matches, MatchingConfig
+from topoloc.features.matching import Matcher, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.camera import UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
@@ -27,9 +35,24 @@ from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import measure_evidence
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search
-from topoloc.localization.walls.place_comparison import Comparison
+from topoloc.localization.walls.upright_pose_kernels import largest_agreement, poses_from_pairs
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
-from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch, count_virtual_views
+from topoloc.localization.walls.virtual_view_matching import (
+    Sides,
+    VirtualViewSearch,
+    count_virtual_views,
+    merge_matches,
+)
+
+_NUM_PAIRS = 1500
+_MAX_YAW = math.radians(35.0)
+# minimum tangent between the two key points of a pair; closer ones do not constrain the distance
+_MIN_SEPARATION = 0.1
+_MIN_DEPTH, _MAX_DEPTH = 0.2, 100.0  # metres: allowed depth of the points of a pair
+_TOLERANCE, _TOLERANCE_SHARE = (
+    0.02,
+    0.015,
+)  # tangents: allowance for a tilted camera, larger off the axis
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,7 +87,126 @@ class VirtualViewProposal(Proposal):
         if not isinstance(final, PoseFit) or final.num_inliers < min_found:
             return None
         with self.search.query.clock.stage("walls"):
-            return _score(self, final)
+            walls, search, num = self.walls, self.search, final.num_inliers
+            guided = walls.guided(search.config.walls.rounds[-1][0])
+            sides = walls.sides_around(final.pose.cam_from_world)
+            counts = count_virtual_views(sides, final.pose.cam_from_world, guided)
+            inflated = (
+                1.0 + num * search.correlated_error_share + search.weights.walls.few_points / num
+            )
+            covariance = final.pose.inflated(inflated)
+            columns_img = final.features.points_img[final.inlier_query_idx, 0]
+            num_left = int(np.count_nonzero(columns_img < final.camera.cx))
+            evidence = replace(
+                measure_evidence(
+                    final,
+                    covariance,
+                    counts.num_visible,
+                    counts.agreeing_img,
+                    counts.visible_img,
+                    search.config.evidence,
+                ),
+                num_matches=len(self.fit.matches),
+                num_inliers=self.num_agreeing,
+                num_by_chance=counts.num_by_chance,
+                num_distinct=_num_distinct(walls, final),
+                num_lesser_side=min(num_left, num - num_left),
+            )
+            log_odds = search.weights.log_odds(evidence)
+            noise_share = final.pose.noise_share(inflated)
+            return Hypothesis("walls", final, evidence, covariance, noise_share, log_odds)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Hold both views beside their predicted content at a place.
+
+    Of the matches of the strongest features, `num_strong` agree on one upright pose. `matchers`
+    match further features of each view.
+    """
+
+    walls: VirtualViewSearch
+    cam_from_place: Rigid3
+    sides: Sides
+    matchers: list[Matcher]
+    num_strong: int
+
+    @staticmethod
+    def of(walls: VirtualViewSearch, place: Rigid3) -> Comparison:
+        """Match the strongest features of both views with the points predicted from a place."""
+        cam_from_place, weights = place.inverse(), walls.search.weights.walls
+        sides, config = walls.sides_around(cam_from_place), walls.search.config.walls.matching
+        matchers = [
+            Matcher(side.features.descriptors, m.descriptors, (m.points_world, m.radii), config)
+            for side, m in sides
+        ]
+        matches = [matcher.match_first(weights.stop.num_strong) for matcher in matchers]
+        agreeing = _find_agreement(sides, matches, cam_from_place)
+        num_strong = 0 if agreeing is None else agreeing[0]
+        return Comparison(walls, cam_from_place, sides, matchers, num_strong)
+
+    def match_all(self) -> VirtualViewProposal | None:
+        """Match all features and propose the upright pose that most matches agree on. None if too
+        few do to recognise a place."""
+        stop = self.walls.search.weights.walls.stop
+        matches = [matcher.match_first() for matcher in self.matchers]
+        agreeing = _find_agreement(self.sides, matches, self.cam_from_place)
+        if agreeing is None or agreeing[0] < stop.min_agreeing:
+            return None
+        merged = merge_matches(self.sides, matches, self.walls.camera)
+        if merged is None:
+            return None
+        return VirtualViewProposal(
+            self.walls.search,
+            "walls",
+            merged,
+            num_agreeing=agreeing[0],
+            cam_from_world=agreeing[1] @ self.cam_from_place,
+            walls=self.walls,
+        )
+
+
+def _find_agreement(
+    sides: Sides, matches: list[Matches], cam_from_place: Rigid3
+) -> tuple[int, Rigid3] | None:
+    """Return the number of matches of both views that agree on one upright pose, and that pose
+    (cam_from_place)."""
+    if not sides:
+        return None
+    seen = [side.tangents[one.query_idx] for (side, _), one in zip(sides, matches, strict=True)]
+    points = [m.points_world[one.train_idx] for (_, m), one in zip(sides, matches, strict=True)]
+    return estimate_upright_pose(np.concatenate(seen), cam_from_place.apply(np.concatenate(points)))
+
+
+def estimate_upright_pose(
+    seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
+) -> tuple[int, Rigid3] | None:
+    """Return the number of matches that agree on one upright pose, and that cam_from_upright.
+
+    None if fewer than three matches agree.
+
+    Args:
+        seen: position of each matched point in the camera, as tangents (x / z, y / z).
+        points: the same points (metres) in the frame of another upright camera. Poses rotated by
+            more than 35 degrees from it are not considered.
+    """
+    if len(seen) < 3:
+        return None
+    pairs = np.random.default_rng(0).integers(0, len(seen), (2, _NUM_PAIRS))
+    limits = _MIN_SEPARATION, _MAX_YAW, _MIN_DEPTH, _MAX_DEPTH
+    turns, shifts = poses_from_pairs(seen, points, pairs, limits)
+    if len(turns) == 0:
+        return None
+    tolerances = _TOLERANCE + _TOLERANCE_SHARE * np.sum(seen**2, axis=1)
+    best, num_agreeing = largest_agreement(seen, points, turns, shifts, tolerances, _MIN_DEPTH)
+    if num_agreeing < 3:
+        return None
+    return num_agreeing, _upright_pose(float(turns[best]), shifts[best])
+
+
+def _upright_pose(turn: float, shift: Float[np.ndarray, " 3"]) -> Rigid3:
+    c, s = math.cos(turn), math.sin(turn)
+    return Rigid3(np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]), shift)
 
 
 def propose_virtual_views(search: Search) -> Iterator[Proposal]:
@@ -144,7 +286,7 @@ def _look_closer(
         search = one.walls.search
         return not any(_are_near(search, one.cam_from_world, k.cam_from_world) for k in tried)
 
-    found = _propose(compared)
+    found = compared.match_all()
     if found is None or not is_new(found):
         return None
     found = _compare_again(found)
@@ -156,23 +298,8 @@ def _compare_again(proposal: VirtualViewProposal) -> VirtualViewProposal:
 
     The candidate place was only near the pose.
     """
-    again = _propose(Comparison.of(proposal.walls, proposal.cam_from_world.inverse()))
+    again = Comparison.of(proposal.walls, proposal.cam_from_world.inverse()).match_all()
     return again if again is not None and again.num_agreeing > proposal.num_agreeing else proposal
-
-
-def _propose(compared: Comparison) -> VirtualViewProposal | None:
-    agreed = compared.match_all()
-    if agreed is None:
-        return None
-    walls = compared.walls
-    return VirtualViewProposal(
-        walls.search,
-        "walls",
-        agreed.matches,
-        num_agreeing=agreed.num_agreeing,
-        cam_from_world=agreed.cam_from_world,
-        walls=walls,
-    )
 
 
 def _fit(
@@ -193,35 +320,6 @@ def _fit(
     if isinstance(anew, PoseFit) and _are_near(walls.search, anew.pose.cam_from_world, near):
         refined = max(refined, anew, key=lambda fit: fit.num_inliers)
     return refined if isinstance(refined, PoseFit) else None
-
-
-def _score(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis:
-    walls, search, num = proposal.walls, proposal.search, final.num_inliers
-    guided = walls.guided(search.config.walls.rounds[-1][0])
-    sides = walls.sides_around(final.pose.cam_from_world)
-    counts = count_virtual_views(sides, final.pose.cam_from_world, guided)
-    inflated = 1.0 + num * search.correlated_error_share + search.weights.walls.few_points / num
-    covariance = final.pose.inflated(inflated)
-    columns_img = final.features.points_img[final.inlier_query_idx, 0]
-    num_left = int(np.count_nonzero(columns_img < final.camera.cx))
-    evidence = replace(
-        measure_evidence(
-            final,
-            covariance,
-            counts.num_visible,
-            counts.agreeing_img,
-            counts.visible_img,
-            search.config.evidence,
-        ),
-        num_matches=len(proposal.fit.matches),
-        num_inliers=proposal.num_agreeing,
-        num_by_chance=counts.num_by_chance,
-        num_distinct=_num_distinct(walls, final),
-        num_lesser_side=min(num_left, num - num_left),
-    )
-    log_odds = search.weights.log_odds(evidence)
-    noise_share = final.pose.noise_share(inflated)
-    return Hypothesis("walls", final, evidence, covariance, noise_share, log_odds)
 
 
 def _num_distinct(walls: VirtualViewSearch, final: PoseFit) -> int:

@@ -1,5 +1,5 @@
-"""Numba kernels of `place_comparison.py`: upright poses from pairs of matches, and the pose with
-the most agreeing matches."""
+"""Numba kernels of `propose_virtual_views.py`: upright poses from pairs of matches, and the pose
+with the most agreeing matches."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.mapping.georeferencing import (
+from topoloc.mapping.georeference_fit import (
     UpDirection,
     estimate_up_direction,
     fit_georeference,
