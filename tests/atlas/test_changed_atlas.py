@@ -69,7 +69,7 @@ def test_check_compares_places_on_earth(room_map: Path, other_map: Path, tmp_pat
 
 
 def _problems(where: Path) -> list[str]:
-    return list(Atlas.open(str(where)).problems.values())
+    return list(Atlas.open(str(where)).index.problems.values())
 
 
 def _places(where: Path) -> Path:

@@ -19,6 +19,8 @@ _NUM_FINE_DECIMALS = 7
 # Maximum number of digits before the decimal point. Parsing an integer of a million digits takes
 # minutes.
 _MAX_DIGITS = 25
+# Up to ten digits are seconds, not nanoseconds. These fit into 64 bits as nanoseconds.
+_PLAIN_SECONDS = re.compile(r"[0-8]?[0-9]{1,9}(?:\.[0-9]{1,9})?")
 _DECIMAL_COMMA = re.compile(r"(?<![^\s;])([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)(?=[\s;]|$)")
 _TIME_AND_NAME = re.compile(r"([^\s,;]+)[\s,;]+(.+?\.[A-Za-z]\w{2,3}(?=[\s,;]|$)|[^\s,;]+)")
 
@@ -40,30 +42,71 @@ def read_text(path: Path, error: type[TopolocError], missing: str = "no such fil
 
 
 def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str]]]:
-    """Return line number and columns (split at spaces, commas and semicolons) of each line. Blank
-    lines and comments (``#``) are skipped.
+    """Return line number and columns (split at spaces and commas) of each line. Blank lines and
+    comments (``#``) are skipped.
 
     Raises:
         error: the file is missing, not text, or has no rows. Names it.
     """
-    text = read_text(path, error)
-    if "," in text or ";" in text:
-        lines = map(_with_decimal_points, text.splitlines())
-        text = "\n".join(lines).replace(",", " ").replace(";", " ")
     rows = [
         (number, columns)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if (columns := line.partition("#")[0].split())
+        for number, line in enumerate(_read_lines(path, error), start=1)
+        if (columns := line.split())
     ]
     if not rows:
         raise error(f"{path}: nothing in this file")
     return rows
 
 
+def _read_lines(path: Path, error: type[TopolocError]) -> list[str]:
+    """Return the lines without comments, with spaces instead of commas and semicolons."""
+    text = read_text(path, error)
+    if "," in text or ";" in text:
+        lines = map(_with_decimal_points, text.splitlines())
+        text = "\n".join(lines).replace(",", " ").replace(";", " ")
+    return [line.partition("#")[0] for line in text.splitlines()]
+
+
 def _with_decimal_points(line: str) -> str:
     """Replace the decimal commas of a line whose columns are separated by spaces or semicolons."""
     has_columns = len(line.split(None, 1)) > 1 or ";" in line
     return _DECIMAL_COMMA.sub(r"\1.\2", line) if has_columns else line
+
+
+def read_numeric_table(
+    path: Path, error: type[TopolocError]
+) -> tuple[Float[np.ndarray, "n c"], list[str]] | None:
+    """Read a file that contains only finite numbers, equally many per line, in one pass. Comments
+    are skipped. Return the numbers and the lines, or None for any other file.
+
+    Raises:
+        error: the file is missing or not text.
+    """
+    lines = [line for line in _read_lines(path, error) if line and not line.isspace()]
+    if not lines:
+        return None
+    try:
+        numbers = np.loadtxt(lines, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return (numbers, lines) if len(numbers) == len(lines) and np.isfinite(numbers).all() else None
+
+
+def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
+    """Parse times as `parse_times`, if all are written alike, such as ``1403636579.763555584``.
+    Return None otherwise."""
+    tokens = [line.split(None, 1)[0] for line in lines]
+    lengths = {len(token.partition(".")[2]) for token in tokens}
+    if len(lengths) > 1 or not all(map(_PLAIN_SECONDS.fullmatch, tokens)):
+        return None
+    num_decimals = lengths.pop()
+    units = np.array([int(token.replace(".", "")) for token in tokens], np.int64)
+    t_ns = units * 10 ** (9 - num_decimals)
+    steps = np.diff(t_ns)
+    step_s = float(np.median(steps)) / NANOSECONDS_PER_SECOND if len(steps) else 0.0
+    is_fine = num_decimals >= _NUM_FINE_DECIMALS
+    in_seconds = is_fine or _find_digits(t_ns[-1] / NANOSECONDS_PER_SECOND, step_s) == 9
+    return t_ns.tolist() if in_seconds and (steps > 0).all() else None
 
 
 def parse_times(

@@ -35,6 +35,8 @@ from topoloc.recordings.text_files import (
     check_rows,
     parse_numbers,
     parse_times,
+    parse_uniform_times,
+    read_numeric_table,
     read_rows,
 )
 
@@ -84,25 +86,7 @@ class Trajectory:
             TrajectoryError: the file is missing or empty, the number of columns is wrong, a number
                 is NaN, a rotation is invalid, or times do not increase. Names the line.
         """
-        rows = read_rows(path, TrajectoryError)
-        num_columns = len(rows[0][1])
-        if num_columns not in (8, 12):
-            raise TrajectoryError(
-                f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI"
-                " line 12"
-            )
-        for line, tokens in rows:
-            if len(tokens) != num_columns:
-                raise TrajectoryError(
-                    f"{path}, line {line}: {len(tokens)} columns, the lines before have"
-                    f" {num_columns}"
-                )
-        if num_columns == 8:
-            return timed_trajectory(path, rows, range(1, 8))
-        numbers = parse_numbers(path, rows, range(12))
-        poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
-        check_rows(is_rotation, "not a rotation", path, rows)
-        return Trajectory(poses)
+        return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
 
     def interpolate(self, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:
         """Return the pose at each time.
@@ -159,6 +143,39 @@ def has_answers(path: Path) -> bool:
     with suppress(OSError), path.open("rb") as file:
         return file.read(len(_ANSWERS_HEADER)) == _ANSWERS_HEADER.encode()
     return False
+
+
+def _read_numeric_trajectory(path: Path) -> Trajectory | None:
+    """Read a valid file of numbers in one pass. Return None for any other file, which is then read
+    line by line."""
+    numbers, lines = read_numeric_table(path, TrajectoryError) or (np.zeros((0, 0)), [])
+    if numbers.shape[1] == 12:
+        poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
+        return Trajectory(poses) if is_rotation.all() else None
+    t_ns, rows = parse_uniform_times(lines) if numbers.shape[1] == 8 else None, numbers[:, 1:]
+    if t_ns is None or not _is_unit_quaternion(rows[:, 3:]).all():
+        return None
+    return Trajectory.from_quaternions(rows, t_ns)
+
+
+def _trajectory_from_rows(path: Path) -> Trajectory:
+    rows = read_rows(path, TrajectoryError)
+    num_columns = len(rows[0][1])
+    if num_columns not in (8, 12):
+        raise TrajectoryError(
+            f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12"
+        )
+    for line, tokens in rows:
+        if len(tokens) != num_columns:
+            raise TrajectoryError(
+                f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}"
+            )
+    if num_columns == 8:
+        return timed_trajectory(path, rows, range(1, 8))
+    numbers = parse_numbers(path, rows, range(12))
+    poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
+    check_rows(is_rotation, "not a rotation", path, rows)
+    return Trajectory(poses)
 
 
 def timed_trajectory(path: Path, rows: Rows, columns: Sequence[int]) -> Trajectory:
