@@ -137,8 +137,8 @@ def compare_with_calibration(
         matches: returns all matches: the pose by a wrong camera chose its inliers.
         scale: the original image is so many times as wide.
     """
-    # probabilities of the calibration; of 421 images of six places one is accused by the second, and
-    # of 20 far beside the map one more (`docs/journal/localization.md`)
+    # probabilities of the calibration; the second accuses one of 421 images of six places, one of
+    # 21 from far beside the map (`docs/journal/localization.md`)
     settled, contradicted = 0.9, 0.01
     prior, unchanged = _prior(camera, may_turn), unchanged_camera()
     first = linearized_fit(inliers, cam_from_world, unchanged)
