@@ -35,13 +35,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from topoloc.localization.walls.place_comparison import Comparison
 
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.proposals.propose import propose_first
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search, Trace
-from topoloc.localization.walls.place_comparison import Comparison
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
@@ -262,16 +262,16 @@ def agreements(search: Search, frame: StereoFrame) -> Iterator[tuple[str, bool, 
     among those of the whole views."""
     index, stop = search.map.walls, search.weights.walls.stop
     assert index is not None
-    whole = VirtualViewSearch.of(search, index)
-    compared = [Comparison.of(whole, place) for place in whole.places]
+    whole = VirtualViewSearch.around(search, index)
+    compared = [Comparison.at_place(whole, place) for place in whole.places]
     proposed = [(one, found) for one in compared if (found := one.match_all()) is not None]
     errors = [error_of(found.cam_from_world.inverse(), frame) for _, found in proposed]
     near_right = [
         pair for pair, (m, deg) in zip(proposed, errors, strict=True) if m < 0.5 and deg < 10.0
     ]
     is_right, chosen = bool(near_right), near_right or proposed
-    parts = VirtualViewSearch.of(search, index, stop.near_tangent or float("inf"))
-    strong = [Comparison.of(parts, place).num_strong for place in parts.places]
+    parts = VirtualViewSearch.around(search, index, stop.near_tangent or float("inf"))
+    strong = [Comparison.at_place(parts, place).num_strong for place in parts.places]
     yield "nearest parts, strong", is_right, max(strong, default=0)
     strong = [one.num_strong for one, _ in chosen]
     yield "whole views, strong", is_right, max(strong, default=0)

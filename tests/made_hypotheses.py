@@ -11,8 +11,8 @@ from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import load_fitted_weights
-from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import LocalMap, PoseFit
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.query import Query
@@ -92,7 +92,7 @@ def believed(hypotheses: list[Hypothesis], config: LocalizerConfig | None = None
     belief does not read it."""
     query = Query(np.zeros((CAMERA.height, CAMERA.width), np.uint8), CAMERA, 1.0, FeatureConfig())
     resolved = (config or LocalizerConfig()).for_feature_type(SURF)
-    not_open = object.__new__(OpenMap)
+    not_open = object.__new__(FeatureMap)
     not_open.node_ids, not_open.kind = list(range(10)), SURF
     search = Search(
         query, not_open, resolved, WEIGHTS, correlated_error_share=0.0, ranked=[NodeScore(3, 0.5)]

@@ -91,7 +91,7 @@ def test_the_second_look_needs_matches_in_most_parts_of_the_view(
     for shown in (image, strip):
         context, query = Localizer(room).context, QueryImage(shown, CAMERA)
         searches = context.searches(query, StageClock(), Deadline())
-        around = Surroundings.of(searches, truth.inverse(), load_last_step_weights())
+        around = Surroundings.at_pose(searches, truth.inverse(), load_last_step_weights())
         gains.append(around.compute_gain(truth.inverse()))
     assert gains[0] > 0.0
     assert gains[1] == 0.0

@@ -81,9 +81,9 @@ def test_features_are_extracted_at_first_use_and_once():
 
 def test_a_query_is_late_from_its_deadline_on():
     assert not Query(IMAGE, _camera(300.0), 1.0, FeatureConfig()).deadline.is_past
-    assert Deadline.of(-1.0).is_past
-    later = Deadline.of(1e6)
-    assert Deadline.of(later) is later
+    assert Deadline.from_limit(-1.0).is_past
+    later = Deadline.from_limit(1e6)
+    assert Deadline.from_limit(later) is later
     assert not later.is_past
     later.stop.set()
     assert later.is_past

@@ -15,9 +15,9 @@ from tiny_world import CAMERA
 from topoloc.errors import FeatureTypeError, WeightsError
 from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.alignment import translation_error
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
-from topoloc.localization.open_map import OpenMap
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.config import MapConfig
@@ -95,7 +95,7 @@ def test_it_localizes_with_the_second_type_alone(path: Path):
 
 def test_a_feature_type_outside_of_the_map_is_refused(of_two: TopoMetricMap):
     with pytest.raises(FeatureTypeError, match=r"no features xfeat \(it holds: surf, sift\)"):
-        OpenMap(of_two, kind="xfeat")
+        FeatureMap(of_two, kind="xfeat")
 
 
 def test_the_cells_of_a_network_are_learned_stored_and_used(

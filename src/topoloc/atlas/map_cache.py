@@ -42,6 +42,7 @@ class OpenedMap(Protocol):
     @property
     def topomap(self) -> TopoMetricMap:
         """Return the map."""
+        ...
 
 
 M = TypeVar("M", bound=OpenedMap)

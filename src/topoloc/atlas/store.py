@@ -47,6 +47,7 @@ class Store(Protocol):
         Raises:
             AtlasError: it cannot be read.
         """
+        ...
 
     def version(self) -> Hashable | None:
         """Return a value that changes with each write of the manifest, None if there is none.
@@ -56,6 +57,7 @@ class Store(Protocol):
         Raises:
             AtlasError: it cannot be read.
         """
+        ...
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
         """Replace the manifest if it is still `before`. Otherwise return False and change nothing.
@@ -63,10 +65,12 @@ class Store(Protocol):
         Raises:
             AtlasError: it cannot be written.
         """
+        ...
 
     def put(self, name: str, path: Path) -> None:
         """Store a copy of a file under a name derived from its contents. An existing file gets age
         0."""
+        ...
 
     def local_path(self, name: str, sha256: str) -> Path:
         """Return a local file with these contents.
@@ -75,6 +79,7 @@ class Store(Protocol):
             AtlasError: the file is missing or differs.
             ObjectStoreError: the store does not respond.
         """
+        ...
 
     def cached(self, name: str, sha256: str) -> Path | None:
         """Return `local_path` if nothing must be fetched, None otherwise.
@@ -82,12 +87,15 @@ class Store(Protocol):
         Raises:
             AtlasError: the file is missing.
         """
+        ...
 
     def ages(self, folder: str) -> dict[str, float]:
         """Return the seconds since each file of a folder of the store was stored, by name."""
+        ...
 
     def remove(self, name: str) -> None:
         """Delete a file, if it exists."""
+        ...
 
 
 class FolderStore:

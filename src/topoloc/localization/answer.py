@@ -185,7 +185,7 @@ def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> flo
 def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
     """Return whether the best hypothesis is not clear and the other is at another place."""
     is_vague = not other.evidence.is_of_nodes and other.evidence.doubt > 1.0  # a wall, somewhere
-    if search.weights.of(best.evidence).is_clear(best.log_odds) or is_vague:
+    if search.weights.for_evidence(best.evidence).is_clear(best.log_odds) or is_vague:
         return False
     max_distance, max_angle = 2.0 * search.config.evidence.max_translation, math.radians(10.0)
     return not best.world_from_cam.is_same(other.world_from_cam, max_distance, max_angle)
@@ -217,7 +217,7 @@ def _build_localization(
 def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     """Inflate the noise by errors that inliers share within parts of the image. Errors common to
     all of it are those of nodes. Virtual views have an inflation of their own."""
-    if search.weights.of(best.evidence).few_points:
+    if search.weights.for_evidence(best.evidence).few_points:
         return best
     seen = best.fit.inlier_observations(1.0)
     parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances

@@ -271,13 +271,13 @@ class FittedWeights:
         """Return whether the weights were fitted to this feature type."""
         return self.calibration_error is not None
 
-    def of(self, evidence: Evidence) -> EvidenceWeights | VirtualViewWeights:
+    def for_evidence(self, evidence: Evidence) -> EvidenceWeights | VirtualViewWeights:
         """Return the weights of this evidence: of the map's nodes, or of virtual views."""
         return self.evidence if evidence.is_of_nodes else self.walls
 
     def log_odds(self, evidence: Evidence) -> float:
         """Return the log-odds that a pose with this evidence is right."""
-        return compute_log_odds(evidence, self.of(evidence))
+        return compute_log_odds(evidence, self.for_evidence(evidence))
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object of a file of weights."""

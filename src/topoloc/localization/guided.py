@@ -198,7 +198,7 @@ def count_consistent_displacements(
     `within_px` refers to an image whose longer side is 640 pixels, and scales with the image size.
     """
     shifts = features.points_img[matches.query_idx] - predicted[matches.train_idx, :2]
-    return int(largest_agreement(shifts, np.float32(within_px * camera.radius_scale)))
+    return int(largest_shift_agreement(shifts, np.float32(within_px * camera.radius_scale)))
 
 
 # Numba kernels
@@ -301,7 +301,7 @@ def match_projections(
 
 
 @kernel()
-def largest_agreement(shifts, within):
+def largest_shift_agreement(shifts, within):
     """Return the largest number of rows of `shifts` (n, 2) that lie within this distance of one."""
     most = 0
     for i in range(len(shifts)):

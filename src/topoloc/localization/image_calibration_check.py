@@ -34,6 +34,7 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     CameraObservations,
+    JointFit,
     estimate_intrinsics,
     fit_camera,
     fit_jointly,
@@ -161,7 +162,7 @@ def compare_with_calibration(
     else:
         other, seen_as = refit_camera(seen, joint, prior, best) or other, camera
         deviation = replace(_deviation(other), is_distorted=not best.is_turning)
-    others = {key: (odds / (1.0 - share), *rest) for key, (odds, *rest) in weighed.items()}
+    others = {key: (p / (1.0 - share), mean, cov) for key, (p, mean, cov) in weighed.items()}
     belief = weigh_poses(joint, others, (best, other.camera))
     found = SeenCamera(seen_as, other.cam_from_world, belief, other.camera[8:])
     if best.is_turning:

@@ -102,8 +102,8 @@ class Localizer:
         self.config = config or LocalizerConfig()
         check_bounds(self.config)
 
-        def open_map(topomap: TopoMetricMap) -> MapContext:
-            opened = MapContext.of(topomap, self.config, coarse, weights, features)
+        def open_context(topomap: TopoMetricMap) -> MapContext:
+            opened = MapContext.from_map(topomap, self.config, coarse, weights, features)
             for kind, lacking in opened.unavailable_types.items():
                 warn(f"features {kind} of the map are not used: {lacking}")
             return opened
@@ -114,13 +114,13 @@ class Localizer:
             source = open_place(str(source)).visit(TopoMetricMap.load, lambda atlas: atlas)
         self.source = source
         if isinstance(source, TopoMetricMap):
-            self._tiles = Tiles(open_map(source))
+            self._tiles = Tiles(open_context(source))
         else:
             # a single map does not need these modules
             from topoloc.atlas.map_cache import MapCache
             from topoloc.localization.tiles.atlas_tiles import AtlasTiles
 
-            maps = maps or MapCache.with_memory([], lambda one: Localizer(open_map(one)), 512)
+            maps = maps or MapCache.with_memory([], lambda one: Localizer(open_context(one)), 512)
             self._tiles = AtlasTiles(source, maps, self.tile_config, warn)
 
     def __reduce__(self) -> tuple[type[Localizer], tuple[Any, ...], dict[str, Any]]:
@@ -250,7 +250,7 @@ class Localizer:
         The reported poses are the result's own pose, or its alternatives. The query image caches
         its features, which several maps can share.
         """
-        deadline = Deadline.of(self.config.max_ms if max_ms is None else max_ms)
+        deadline = Deadline.from_limit(self.config.max_ms if max_ms is None else max_ms)
         schedule = Schedule(
             self._tiles, self.tile_config, query_image, deadline, self._reach, trace
         )

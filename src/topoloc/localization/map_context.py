@@ -12,9 +12,9 @@ from topoloc.errors import WeightsError
 from topoloc.features.feature_types import check_available, select_stored_types
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
 from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement
-from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Deadline, Query, QueryImage, StageClock, reduce_image
 from topoloc.localization.result import NotLocalized, R
@@ -33,13 +33,13 @@ class FeatureTypeContext:
     (`correlated_errors.py`).
     """
 
-    map: OpenMap
+    map: FeatureMap
     config: LocalizerConfig
     weights: FittedWeights
     correlated_errors: float
 
     @staticmethod
-    def of(
+    def from_map(
         topomap: TopoMetricMap,
         kind: str,
         config: LocalizerConfig,
@@ -48,15 +48,15 @@ class FeatureTypeContext:
     ) -> FeatureTypeContext:
         """Open a map for a feature type.
 
-        `weights` replaces the shipped weights. Raises the errors of `OpenMap`.
+        `weights` replaces the shipped weights. Raises the errors of `FeatureMap`.
         """
-        opened = OpenMap(topomap, coarse or config.coarse, kind)
+        opened = FeatureMap(topomap, coarse or config.coarse, kind)
         c, weights = config.for_feature_type(opened.kind), weights or _select_weights(opened)
         rho = ErrorShareMeasurement(topomap, kind, c.guided, c.pose, weights.shared_errors)
         return FeatureTypeContext(opened, c, weights, rho.find())
 
 
-def _select_weights(opened: OpenMap) -> FittedWeights:
+def _select_weights(opened: FeatureMap) -> FittedWeights:
     """Return the shipped weights. Those of virtual views belong to their own feature type."""
     kind = opened.kind.name
     weights, sides = load_fitted_weights(kind), opened.topomap.sides_for(kind)
@@ -79,7 +79,7 @@ class MapContext:
     unavailable_types: dict[str, str]
 
     @staticmethod
-    def of(
+    def from_map(
         topomap: TopoMetricMap,
         config: LocalizerConfig,
         coarse: CoarseLocalizer | None = None,
@@ -92,7 +92,7 @@ class MapContext:
             requested = select_stored_types(topomap.kinds, features)
         kinds, unavailable_types = select_feature_types(topomap, requested)
         types = tuple(
-            FeatureTypeContext.of(
+            FeatureTypeContext.from_map(
                 topomap, kind, config, coarse, weights if kind == kinds[0] else None
             )
             for kind in kinds

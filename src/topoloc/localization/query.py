@@ -60,7 +60,7 @@ class Deadline:
     stop: threading.Event = field(default_factory=threading.Event)
 
     @staticmethod
-    def of(limit: float | Deadline | None) -> Deadline:
+    def from_limit(limit: float | Deadline | None) -> Deadline:
         """Return the deadline in so many milliseconds, or the given one."""
         if isinstance(limit, Deadline):
             return limit
@@ -81,7 +81,7 @@ class SharedFeatures:
     def __init__(self) -> None:
         self._kept: dict[tuple[int, int, FeatureConfig, Hashable], Features] = {}
 
-    def of(self, query: Query) -> Features:
+    def features_of(self, query: Query) -> Features:
         """Return the features of the image as reduced for this query."""
         return self.get_or_extract(query, None, query.extract_features)
 
@@ -109,7 +109,7 @@ class StoredFeatures(SharedFeatures):
         super().__init__()
         self._known, self._width = known, width
 
-    def of(self, query: Query) -> Features:
+    def features_of(self, query: Query) -> Features:
         """Return the features, scaled to the image as reduced for this query.
 
         Raises:
@@ -182,7 +182,7 @@ class Query:
     @cached_property
     def features(self) -> Features:
         """Return the local features."""
-        return self.shared.of(self)
+        return self.shared.features_of(self)
 
     def extract_features(self) -> Features:
         """Normalise patches, then extract the local features."""

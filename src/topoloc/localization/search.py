@@ -14,8 +14,8 @@ from topoloc.json_data import OneLine
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.exact.patch_alignment import PointTemplates
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import FittedWeights
-from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PointMatches, PoseFit
 from topoloc.localization.query import Query
 from topoloc.localization.result import CandidateNode
@@ -110,7 +110,7 @@ class Search:
     """
 
     query: Query
-    map: OpenMap
+    map: FeatureMap
     config: LocalizerConfig
     weights: FittedWeights
     correlated_error_share: float

@@ -77,18 +77,22 @@ class StereoSequence(Protocol):
     @property
     def name(self) -> str:
         """Return the recording's name, for reports."""
+        ...
 
     @property
     def names(self) -> list[str]:
         """Return the name of each frame: the path of its image relative to the recording."""
+        ...
 
     @property
     def t_ns(self) -> list[int]:
         """Return the time of each frame, in integer nanoseconds."""
+        ...
 
     @property
     def poses(self) -> list[Rigid3 | None]:
         """Return world_from_cam of each frame, None if unknown. No image is read."""
+        ...
 
     def __len__(self) -> int: ...
 

@@ -94,6 +94,7 @@ class CoarseLocalizer(Protocol):
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """Return up to `num_candidates` distinct nodes by their rows in the map, best first.
         `features` are those of `image`, also used by the fine step."""
+        ...
 
 
 @runtime_checkable
@@ -105,6 +106,7 @@ class DescriptorLocalizer(CoarseLocalizer, Protocol):
     ) -> CoarseLocalizer:
         """Return a localizer with reduced differences between groups of nodes. `group_of_node` is
         indexed by a node's row."""
+        ...
 
 
 @runtime_checkable
@@ -115,6 +117,7 @@ class ExtendableLocalizer(CoarseLocalizer, Protocol):
         self, images: Sequence[Image], node_ids: Int[np.ndarray, " n"]
     ) -> CoarseModel:
         """Return the stored model extended by these images, each with the id of its node."""
+        ...
 
 
 Opener = Callable[[CoarseModel], CoarseLocalizer]

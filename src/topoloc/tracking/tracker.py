@@ -110,7 +110,7 @@ class Tracker:
                 is_repeated=True,
             )
         self._image = image.copy()  # the caller may reuse the buffer
-        limit = Deadline.of(self.localizer.config.max_ms if max_ms is None else max_ms)
+        limit = Deadline.from_limit(self.localizer.config.max_ms if max_ms is None else max_ms)
         self._answer = self._process_in_tile(image, camera, t_ns, odom_from_cam, limit)
         return self._answer
 

@@ -13,15 +13,15 @@ from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization import open_map
+from topoloc.localization import feature_map
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import with_repetitions
 from topoloc.localization.map_facts.repetition import (
     find_repetition_shifts,
     fold_repetitions,
 )
-from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.storage.integrity_check import find_map_damage
@@ -98,14 +98,14 @@ def test_folded_points_of_all_panels_are_the_points_of_one():
 # moves across the whole map
 
 
-def _turned(opened: OpenMap, row: int) -> list[Rigid3]:
+def _turned(opened: FeatureMap, row: int) -> list[Rigid3]:
     """Return the transforms with a rotation. All surfaces of this room are blobs,
     which look similar."""
     return [move for move in map(Rigid3.from_matrix, opened.moves(row)) if move.angle() > 0.1]
 
 
 def test_a_room_that_stands_twice_in_the_map_is_moved_onto_its_copy_and_back(room: TopoMetricMap):
-    opened, num_nodes = OpenMap(twice(room)), len(room.nodes)
+    opened, num_nodes = FeatureMap(twice(room)), len(room.nodes)
     num_found = 0
     for row in range(2 * num_nodes):
         expected = ELSEWHERE if row < num_nodes else ELSEWHERE.inverse()
@@ -116,7 +116,7 @@ def test_a_room_that_stands_twice_in_the_map_is_moved_onto_its_copy_and_back(roo
 
 
 def test_a_room_that_stands_once_in_the_map_has_no_copy(room: TopoMetricMap):
-    opened = OpenMap(room)
+    opened = FeatureMap(room)
     assert not any(_turned(opened, row) for row in range(len(room.nodes)))
 
 
@@ -126,9 +126,9 @@ def test_repetitions_of_the_build_are_stored_and_not_searched_again(
     built = with_repetitions(twice(room))
     built.save(tmp_path / "twice.topo")
     sought = []
-    monkeypatch.setattr(open_map, "find_repetition_shifts", lambda *given: sought.append(given))
+    monkeypatch.setattr(feature_map, "find_repetition_shifts", lambda *given: sought.append(given))
     with TopoMetricMap.load(tmp_path / "twice.topo") as topomap:
-        opened = OpenMap(topomap)
+        opened = FeatureMap(topomap)
         for row, node_id in enumerate(opened.node_ids):
             assert built.repetitions is not None
             np.testing.assert_array_equal(
@@ -142,7 +142,7 @@ def test_repetitions_of_changed_nodes_are_searched_again(room: TopoMetricMap):
     assert room.repetitions is not None
     doubled = twice(room)
     assert doubled.repetitions is room.repetitions
-    assert any(_turned(OpenMap(doubled), row) for row in range(len(doubled.nodes)))
+    assert any(_turned(FeatureMap(doubled), row) for row in range(len(doubled.nodes)))
 
 
 class _OnlyTheFirstRoom:

@@ -17,13 +17,13 @@ def _walls(seed: int, number: int) -> VirtualViewSearch:
     query_image = QueryImage(seen_on_the_way_back(seed)[number][0], WIDE)
     search = localizer.context.searches(query_image, StageClock(), Deadline())[-1]
     assert search.map.walls is not None
-    return VirtualViewSearch.of(search, search.map.walls)
+    return VirtualViewSearch.around(search, search.map.walls)
 
 
 def test_most_strong_matches_agree_at_the_true_place_and_more_of_all():
     truth = seen_on_the_way_back()[2][1]
     walls = _walls(0, 2)
-    compared = Comparison.of(walls, truth)
+    compared = Comparison.at_place(walls, truth)
     agreed = compared.match_all()
     assert agreed is not None
     assert walls.search.weights.walls.stop.min_strong < compared.num_strong < agreed.num_agreeing
@@ -34,7 +34,7 @@ def test_most_strong_matches_agree_at_the_true_place_and_more_of_all():
 
 def test_views_of_another_corridor_agree_nowhere():
     walls = _walls(1, 2)
-    compared = [Comparison.of(walls, place) for place in walls.places]
+    compared = [Comparison.at_place(walls, place) for place in walls.places]
     assert compared
     assert max(one.num_strong for one in compared) < walls.search.weights.walls.stop.min_strong
     assert all(one.match_all() is None for one in compared)

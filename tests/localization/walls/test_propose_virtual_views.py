@@ -33,9 +33,9 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import VirtualViewSearchConfig
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import WallStop, load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.open_map import OpenMap
 from topoloc.localization.query import Deadline, Query, QueryImage, StageClock
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, verify
@@ -248,11 +248,11 @@ def _by_the_walls(
 def _search(
     topomap: TopoMetricMap, picture: np.ndarray, config: VirtualViewSearchConfig | None = None
 ) -> Search:
-    open_map = OpenMap(topomap)
+    feature_map = FeatureMap(topomap)
     resolved = LocalizerConfig(walls=config or VirtualViewSearchConfig()).for_feature_type(SURF)
     return Search(
-        Query(picture, WIDE, 1.0, open_map.feature_config),
-        open_map,
+        Query(picture, WIDE, 1.0, feature_map.feature_config),
+        feature_map,
         resolved,
         load_fitted_weights("surf"),
         correlated_error_share=0.1,
@@ -263,10 +263,10 @@ def test_an_inexact_place_is_tried_again_from_its_pose():
     picture, truth = seen_on_the_way_back()[2]
     search = _search(built_corridor(), picture)
     assert search.map.walls is not None
-    walls = VirtualViewSearch.of(search, search.map.walls)
+    walls = VirtualViewSearch.around(search, search.map.walls)
     away = Rigid3(truth.rotation, truth.translation + np.array([0.0, 2.0, 0.0]))
-    from_there = Comparison.of(walls, away).match_all()
-    from_here = Comparison.of(walls, truth).match_all()
+    from_there = Comparison.at_place(walls, away).match_all()
+    from_here = Comparison.at_place(walls, truth).match_all()
     assert from_there is not None
     assert from_here is not None
     again = propose_walls_module._compare_again(from_there)
@@ -316,7 +316,7 @@ def test_places_with_far_fewer_matches_are_skipped_beside_a_clear_pose(
         verify(proposal)
     assert search.is_clear
     assert search.map.walls is not None
-    assert len(VirtualViewSearch.of(search, search.map.walls).places) > 1
+    assert len(VirtualViewSearch.around(search, search.map.walls).places) > 1
     assert min(looked) >= 0.5 * max(looked) - 1
 
 

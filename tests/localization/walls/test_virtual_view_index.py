@@ -30,7 +30,10 @@ def views() -> list[VirtualView]:
 
 
 def _named(index: VirtualViewIndex, views: list[VirtualView]) -> list[CandidatePlaces]:
-    return [CandidatePlaces.of(view, index, np.ones(len(index.axes), np.float32)) for view in views]
+    return [
+        CandidatePlaces.from_similarity(view, index, np.ones(len(index.axes), np.float32))
+        for view in views
+    ]
 
 
 def test_each_virtual_view_gives_a_place_that_faces_its_wall_in_reverse(

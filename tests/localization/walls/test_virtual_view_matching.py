@@ -47,7 +47,7 @@ def _seen() -> list[QueryVirtualView]:
     seen = []
     for view in make_virtual_views(WIDE):
         features = view.select_inside(extract_features(view.picture(PICTURE), FeatureConfig()))
-        seen.append(QueryVirtualView.of(view, features, WIDE))
+        seen.append(QueryVirtualView.from_features(view, features, WIDE))
     return seen
 
 
@@ -170,5 +170,5 @@ def test_a_near_pose_of_both_views_is_refined_in_rounds():
 def test_nothing_matched_is_none():
     assert match_virtual_views([], TRUTH.inverse(), WIDE, GUIDED) is None
     side, points = _around()[0]
-    nothing = QueryVirtualView.of(side.view, Features.empty(64), WIDE)
+    nothing = QueryVirtualView.from_features(side.view, Features.empty(64), WIDE)
     assert match_virtual_views([(nothing, points)], TRUTH.inverse(), WIDE, GUIDED) is None

@@ -85,7 +85,7 @@ def look_again(query: MapQuery, answer: Answer) -> Finding | None:
         for one in search.belief.hypotheses:
             gain, is_near = 0.0, one.log_odds > weights.crowding.min_log_odds
             if is_near and one.evidence.is_of_nodes:
-                around = Surroundings.of(ordered, one.fit.pose.cam_from_world, weights)
+                around = Surroundings.at_pose(ordered, one.fit.pose.cam_from_world, weights)
                 gain = around.compute_gain(one.fit.pose.cam_from_world)
             if gain > 0.0:
                 crowded.append((replace(one, log_odds=one.log_odds + gain), search))
@@ -154,7 +154,7 @@ def refine_precisely(
     searches: Sequence[Search], cam_from_world: Rigid3, weights: LastStepWeights
 ) -> PreciseFit | None:
     """Refine a pose that is accurate to some pixels. None if too few points agree."""
-    around = Surroundings.of(searches, cam_from_world, weights)
+    around = Surroundings.at_pose(searches, cam_from_world, weights)
     fit = around.refine_by_key_points(cam_from_world)
     if fit is None:
         return None
@@ -199,7 +199,7 @@ class Surroundings:
     weights: LastStepWeights
 
     @staticmethod
-    def of(
+    def at_pose(
         searches: Sequence[Search], cam_from_world: Rigid3, weights: LastStepWeights
     ) -> Surroundings:
         """Return the surroundings of a pose."""

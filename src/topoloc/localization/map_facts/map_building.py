@@ -16,10 +16,10 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import select_hypothesis
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement
 from topoloc.localization.map_facts.repetition import digest_of
-from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
 from topoloc.mapping.config import Progress
 from topoloc.mapping.storage.entries import CorrelatedErrors
@@ -132,7 +132,7 @@ def _error_share_of(topomap: TopoMetricMap, kind: str) -> ErrorShareMeasurement:
 
 def with_repetitions(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:
     """Return the map with the repetition moves of its nodes."""
-    opened, moves = OpenMap(topomap), dict[NodeId, Float[np.ndarray, "k 4 4"]]()
+    opened, moves = FeatureMap(topomap), dict[NodeId, Float[np.ndarray, "k 4 4"]]()
     for row, found in enumerate(parallel_map(opened.moves, topomap.rows)):
         if len(found):
             moves[opened.node_ids[row]] = found
@@ -151,7 +151,7 @@ def check_common_world(sequences: Sequence[StereoSequence]) -> list[str]:
     """
     earlier, notes = list[_Views](), list[str]()
     for sequence in sequences:
-        views = _Views.of(sequence)
+        views = _Views.from_sequence(sequence)
         results = (_compare_worlds(one, views) for one in earlier)
         if earlier and views.frames and not any(results):
             notes.append(
@@ -172,7 +172,7 @@ class _Views:
     cache: dict[int, ViewFeatures] = field(default_factory=dict)
 
     @staticmethod
-    def of(sequence: StereoSequence, num_frames: int = 16) -> _Views:
+    def from_sequence(sequence: StereoSequence, num_frames: int = 16) -> _Views:
         poses = {k: pose for k, pose in enumerate(sequence.poses) if pose is not None}
         posed = list(poses) if sequence[0].camera is not None else []
         rows = np.unique(np.linspace(0, len(posed) - 1, min(num_frames, len(posed))).astype(int))

@@ -65,7 +65,7 @@ def find_repetition_shifts(
     found: list[Float[np.ndarray, " 3"]] = []
     least, left = max(min_votes, min_share * len(points)), np.ones(len(shifts), np.bool_)
     grids = [
-        _ShiftVotes.of(shifts, rows, offset) for offset in (0.0, 0.5)
+        _ShiftVotes.from_shifts(shifts, rows, offset) for offset in (0.0, 0.5)
     ]  # overlap: no shift is at a border of both
     while left.any() and len(found) < max_shifts:
         _, voters = max((grid.find_densest_cell(left) for grid in grids), key=lambda most: most[0])
@@ -120,7 +120,7 @@ class _ShiftVotes:
     points: Int[np.ndarray, " n"]
 
     @staticmethod
-    def of(
+    def from_shifts(
         shifts: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], offset: float
     ) -> _ShiftVotes:
         furthest = 1000  # cells in each direction, larger than any shift

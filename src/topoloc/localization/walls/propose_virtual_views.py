@@ -35,7 +35,7 @@ from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import measure_evidence
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search
-from topoloc.localization.walls.upright_pose_kernels import largest_agreement, poses_from_pairs
+from topoloc.localization.walls.upright_pose_kernels import largest_pose_agreement, poses_from_pairs
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
 from topoloc.localization.walls.virtual_view_matching import (
     Sides,
@@ -132,7 +132,7 @@ class Comparison:
     num_strong: int
 
     @staticmethod
-    def of(walls: VirtualViewSearch, place: Rigid3) -> Comparison:
+    def at_place(walls: VirtualViewSearch, place: Rigid3) -> Comparison:
         """Match the strongest features of both views with the points predicted from a place."""
         cam_from_place, weights = place.inverse(), walls.search.weights.walls
         sides, config = walls.sides_around(cam_from_place), walls.search.config.walls.matching
@@ -198,7 +198,7 @@ def estimate_upright_pose(
     if len(turns) == 0:
         return None
     tolerances = _TOLERANCE + _TOLERANCE_SHARE * np.sum(seen**2, axis=1)
-    best, num_agreeing = largest_agreement(seen, points, turns, shifts, tolerances, _MIN_DEPTH)
+    best, num_agreeing = largest_pose_agreement(seen, points, turns, shifts, tolerances, _MIN_DEPTH)
     if num_agreeing < 3:
         return None
     return num_agreeing, _upright_pose(float(turns[best]), shifts[best])
@@ -230,8 +230,8 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     with search.query.clock.stage("walls"):
         if not _may_show_place(search, index):
             return
-        walls = VirtualViewSearch.of(search, index)
-        compared = [Comparison.of(walls, place) for place in walls.places]
+        walls = VirtualViewSearch.around(search, index)
+        compared = [Comparison.at_place(walls, place) for place in walls.places]
         compared.sort(key=lambda one: -one.num_strong)
     tried = list[VirtualViewProposal]()
     for one in compared:
@@ -256,8 +256,10 @@ def _may_show_place(search: Search, index: VirtualViewIndex) -> bool:
     stop = search.weights.walls.stop
     if stop.near_tangent <= 0.0 or search.num_retrieved >= search.config.num_chance_inliers:
         return True
-    near = VirtualViewSearch.of(search, index, stop.near_tangent)
-    return any(Comparison.of(near, place).num_strong >= stop.min_strong for place in near.places)
+    near = VirtualViewSearch.around(search, index, stop.near_tangent)
+    return any(
+        Comparison.at_place(near, place).num_strong >= stop.min_strong for place in near.places
+    )
 
 
 def _is_hopeless(search: Search) -> bool:
@@ -298,7 +300,7 @@ def _compare_again(proposal: VirtualViewProposal) -> VirtualViewProposal:
 
     The candidate place was only near the pose.
     """
-    again = Comparison.of(proposal.walls, proposal.cam_from_world.inverse()).match_all()
+    again = Comparison.at_place(proposal.walls, proposal.cam_from_world.inverse()).match_all()
     return again if again is not None and again.num_agreeing > proposal.num_agreeing else proposal
 
 

@@ -9,7 +9,7 @@ from topoloc.compiled import kernel
 
 
 @kernel()
-def largest_agreement(seen, points, turns, shifts, tolerances, nearest):
+def largest_pose_agreement(seen, points, turns, shifts, tolerances, nearest):
     """Return the row of the pose with the most agreeing matches, and their number.
 
     Match k sees `points[k]` at the tangents `seen[k]`. Pose j rotates the point by `turns[j]` about

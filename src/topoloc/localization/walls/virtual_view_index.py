@@ -95,7 +95,7 @@ class CandidatePlaces:
     likeness: Float32[np.ndarray, " n"]
 
     @staticmethod
-    def of(
+    def from_similarity(
         view: VirtualView, index: VirtualViewIndex, likeness: Float32[np.ndarray, " sides"]
     ) -> CandidatePlaces:
         """Return the places of all virtual views of the opposite side.

@@ -53,7 +53,7 @@ class QueryVirtualView:
     camera: Camera
 
     @staticmethod
-    def of(view: VirtualView, features: Features, camera: Camera) -> QueryVirtualView:
+    def from_features(view: VirtualView, features: Features, camera: Camera) -> QueryVirtualView:
         """Return a view of an image that `camera` took."""
         return QueryVirtualView(view, features, view.to_image_pixels(features, camera), camera)
 
@@ -190,7 +190,7 @@ class VirtualViewSearch:
     places: list[Rigid3]
 
     @staticmethod
-    def of(
+    def around(
         search: Search, index: VirtualViewIndex, max_tangent: float = math.inf
     ) -> VirtualViewSearch:
         """Extract both side views of the query image and select the candidate places.
@@ -207,8 +207,10 @@ class VirtualViewSearch:
             )
             seen_by = (view.name, index.feature_config, max_tangent)
             features = query.shared.get_or_extract(query, seen_by, extract)
-            seen.append(QueryVirtualView.of(view, features, query.input_camera))
-            named.append(CandidatePlaces.of(view, index, index.similarity(picture, features)))
+            seen.append(QueryVirtualView.from_features(view, features, query.input_camera))
+            named.append(
+                CandidatePlaces.from_similarity(view, index, index.similarity(picture, features))
+            )
         apart = num_d_thresh * search.map.d_thresh
         return VirtualViewSearch(
             search,

@@ -36,7 +36,7 @@ from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
 
 
-class OpenMap:
+class FeatureMap:
     """Hold the data of a map that a localizer keeps between queries.
 
     Args:
@@ -83,7 +83,7 @@ class OpenMap:
         )
         self._masked_rows = list[Row]()
 
-    def without(self, rows: Iterable[Row]) -> OpenMap:
+    def without(self, rows: Iterable[Row]) -> FeatureMap:
         """Return the same map without these nodes. The other rows keep their numbers.
 
         Loaded nodes are shared. Virtual views are not used. Raises EmptyMapError if none remains.
