@@ -138,9 +138,7 @@ def compare_with_calibration(
         matches: returns all matches: the pose by a wrong camera chose its inliers.
         scale: the original image is so many times as wide.
     """
-    # probabilities of the calibration; the second accuses one of 421 images of six places, one of
-    # 21 from far beside the map (`docs/journal/localization.md`)
-    settled, contradicted = 0.9, 0.01
+    settled, contradicted = 0.9, 0.05  # probabilities of the calibration
     prior, unchanged = _prior(camera, may_turn), unchanged_camera()
     first = linearized_fit(inliers, cam_from_world, unchanged)
     if first is None:
@@ -167,6 +165,9 @@ def compare_with_calibration(
     found = SeenCamera(seen_as, other.cam_from_world, belief, other.camera[8:])
     if best.is_turning:
         return ImageCalibration(deviation, found)
+    by_calibration = linearized_fit(seen, cam_from_world, unchanged)
+    if by_calibration is None or not _is_better(other, by_calibration, camera):
+        return ImageCalibration(deviation)
     shift = (other.cam_from_world @ cam_from_world.inverse()).log()
     return ImageCalibration(deviation, found, _mismatch(camera, best, deviation, shift, scale))
 
@@ -207,6 +208,18 @@ def _is_far(seen: IntrinsicsDeviation, camera: Camera) -> bool:
     scales = np.array([1.0, *np.repeat(camera.fx / camera.width, 2)])
     deviation, sigmas = np.abs(seen.deviation), np.sqrt(np.diag(seen.covariance))
     return bool(((deviation > num_sigmas * sigmas) & (scales * deviation > share)).any())
+
+
+def _is_better(other: JointFit, by_calibration: JointFit, camera: Camera) -> bool:
+    """Return whether another camera moves evidently more points near their pixels, or only explains
+    errors of the map, such as those of points that are seen from aside."""
+    min_gain, radii_px = 4.0, (1.0, 2.0)  # standard deviations of counts; in a 640 pixel image
+    to_radii = 640.0 * camera.fx / max(camera.width, camera.height)
+    before, after = (
+        to_radii * np.linalg.norm(fit.errors, axis=1) for fit in (by_calibration, other)
+    )
+    counts = [(np.count_nonzero(before < px), np.count_nonzero(after < px)) for px in radii_px]
+    return sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts) >= min_gain
 
 
 def find_focal_doubt(search: Search, fit: PoseFit) -> str:
