@@ -22,8 +22,7 @@ from topoloc.retrieval.backbones import Backbone
 from topoloc.retrieval.cnn_fc import CnnFc, NodeClassifier
 from topoloc.retrieval.cnn_nn import DEPTHS as CNN_DEPTHS, PooledFeatures
 from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel
-from topoloc.retrieval.inference import has_bfloat16
-from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
+from topoloc.retrieval.inference import NetworkDescriptorLocalizer, has_bfloat16
 from topoloc.retrieval.network_images import BackboneName, NetworkInputConfig
 from topoloc.retrieval.vlad_nn import DEPTHS as VLAD_DEPTHS, VladNetwork
 from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig

@@ -35,13 +35,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from topoloc.localization.walls.place_comparison import Comparison
 
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.proposals.propose import propose_first
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search, Trace
+from topoloc.localization.walls.propose_virtual_views import Comparison
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence

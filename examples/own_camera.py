@@ -58,6 +58,8 @@ def main(out: Path) -> None:
         ]
         errors = [translation_error(*pair) for pair in pairs]
         says = f"median error {100.0 * np.median(errors):.2f} cm" if pairs else results[0].detail
+        doubts = [found.calibration_doubt for found in results if found.localized]
+        says += next((f"; {doubt}" for doubt in doubts if doubt), "")
         print(f"with {what}: {len(pairs)} of {len(results)} localized, {says}")
 
 

@@ -122,7 +122,10 @@ def test_own_camera(run: Run, lab: Path, monkeypatch: pytest.MonkeyPatch):
     assert "8 of 8 localized" in with_lens
     (error,) = _centimetres(with_lens, "median error")
     assert error < 1.5
-    assert "0 of 8 localized" in as_pinhole
+    (localized,) = re.findall(r"(\d) of 8 localized", as_pinhole)
+    assert int(localized) >= 5, "by the lens that the images show"
+    (error,) = _centimetres(as_pinhole, "median error")
+    assert error < 4.0
     assert "its lens distorts more than the calibration states" in as_pinhole
 
 

@@ -71,7 +71,7 @@ class PlaceVectors:
 
     def check(self, whole: Path) -> None:
         """All tiles can be ranked."""
-        assert not Atlas.open(str(whole / "atlas")).problems
+        assert not Atlas.open(str(whole / "atlas")).index.problems
 
     def damage(self, whole: Path, folder: Path, rng: np.random.Generator) -> tuple[str, Read]:
         """Damage the bytes, or the arrays."""
@@ -132,7 +132,7 @@ def read_atlas(where: Path, is_queried: bool) -> None:
         manifest.georeference_of(tile)
         tile.to_json()
     Manifest.from_bytes(manifest.to_bytes(), "again")
-    problems = list(atlas.problems.values())
+    problems = list(atlas.index.problems.values())
     for name in atlas.select_tiles():
         try:
             problems += [atlas.find_problem(name) or ""]
@@ -147,7 +147,7 @@ def read_atlas(where: Path, is_queried: bool) -> None:
 
 def _read_places(where: Path, is_queried: bool) -> None:
     atlas = Atlas.open(str(where))
-    problems = [*atlas.problems.values(), *atlas.notes]
+    problems = [*atlas.index.problems.values(), *atlas.index.notes]
     if is_queried:
         Localizer(atlas, warn=problems.append).localize(*_query())
     if problems:

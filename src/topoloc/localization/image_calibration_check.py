@@ -219,7 +219,7 @@ def _is_better(other: JointFit, by_calibration: JointFit, camera: Camera) -> boo
         to_radii * np.linalg.norm(fit.errors, axis=1) for fit in (by_calibration, other)
     )
     counts = [(np.count_nonzero(before < px), np.count_nonzero(after < px)) for px in radii_px]
-    return sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts) >= min_gain
+    return bool(sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts) >= min_gain)
 
 
 def find_focal_doubt(search: Search, fit: PoseFit) -> str:
