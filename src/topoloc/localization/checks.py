@@ -14,7 +14,8 @@ import numpy as np
 from topoloc.localization.answer import Answer, Finding, probability_within
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.exact.appearance import check_colours
-from topoloc.localization.exact.last_step import look_again, refine_answer
+from topoloc.localization.exact.last_step import refine_answer
+from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.image_calibration_check import SeenCamera, check_image_calibration
 from topoloc.localization.map_query import MapQuery
 
@@ -80,7 +81,7 @@ def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:
 
 Check = Callable[[MapQuery, Answer], Finding | None]
 CHECKS: tuple[Check, ...] = (
-    look_again,
+    weigh_pixels,
     check_camera,
     refine_answer,
     check_colours,

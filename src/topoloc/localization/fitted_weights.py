@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from msgspec import Struct, to_builtins
+from msgspec import Struct, structs, to_builtins
 from msgspec.structs import astuple
 
 from topoloc.errors import FeatureTypeError
@@ -278,6 +278,12 @@ class FittedWeights:
     def log_odds(self, evidence: Evidence) -> float:
         """Return the log-odds that a pose with this evidence is right."""
         return compute_log_odds(evidence, self.for_evidence(evidence))
+
+    def place_log_odds(self, evidence: Evidence) -> float:
+        """Return the log-odds that the place is right, for a pose of nodes, as if it were precise
+        and its points lay everywhere in the image."""
+        weights = structs.replace(self.evidence, narrow_spread=0.0)
+        return compute_log_odds(replace(evidence, doubt=0.1), weights)
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object of a file of weights."""

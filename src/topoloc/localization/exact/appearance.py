@@ -14,11 +14,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from msgspec import Struct
 
 from topoloc.errors import FeatureTypeError
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.answer import Answer, Finding
 from topoloc.localization.evidence import sample_rows
@@ -27,6 +28,7 @@ from topoloc.localization.guided import select_visible_points
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search
+from topoloc.node_ids import NodeId
 
 
 class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -89,28 +91,49 @@ class ColourAgreement:
 
 def compare_colours(search: Search, found: Localization, camera: Camera) -> ColourAgreement | None:
     """Compare the colours of the points in view. None: an image is grey, or few points are."""
-    weights, opened = load_appearance_weights(), search.map
+    weights = load_appearance_weights()
     in_query = small_colours(search.query.image)
     if in_query is None:
         return None
+    points = select_shown_points(search, found.node_id, found.world_from_cam, camera)
+    if len(points.places) < weights.min_points:
+        return None
+    of_query = sample_colours(in_query, points.places)
+    of_map = search.templates(points.node_ids).sample_colours(points.points_world)
+    known = np.isfinite(of_map[:, 0])
+    if np.count_nonzero(known) < weights.min_points:
+        return None
+    return _correlate(of_query[known], of_map[known], points.places[known], weights)
+
+
+@dataclass(frozen=True, eq=False)
+class ShownPoints:
+    """Hold map points that an image shows, with the nodes whose images show them. Places are
+    pixels over the image size."""
+
+    places: Float[np.ndarray, "n 2"]
+    points_world: Float[np.ndarray, "n 3"]
+    node_ids: Int[np.ndarray, " n"]
+
+
+def select_shown_points(
+    search: Search, node_id: NodeId, world_from_cam: Rigid3, camera: Camera
+) -> ShownPoints:
+    """Return some of the points in view that no nearer ones hide, of the nodes around a node."""
+    weights, opened = load_appearance_weights(), search.map
     # the nodes near a pose beside a bend look past its walls; those of its inliers do not
-    seen_from = opened.node_poses.world_from_node(opened.topomap.row_of(found.node_id))
+    seen_from = opened.node_poses.world_from_node(opened.topomap.row_of(node_id))
     points = opened.local_map(opened.nearest(seen_from, weights.num_nodes))
-    cam_from_world = found.world_from_cam.inverse()
+    cam_from_world = world_from_cam.inverse()
     rows, pixels = select_visible_points(points, cam_from_world, camera)
     places = pixels / [camera.width, camera.height]
     depths = cam_from_world.apply(points.points_world[rows])[:, 2]
     shown = np.flatnonzero(_is_shown(places, depths, weights))
-    if len(shown) < weights.min_points:
-        return None
-    sampled = shown[sample_rows(len(shown))]
-    positions, node_ids = points.points_world[rows[sampled]], points.node_ids[rows[sampled]]
-    of_query = sample_colours(in_query, places[sampled])
-    of_map = search.templates(node_ids).sample_colours(positions)
-    known = np.isfinite(of_map[:, 0])
-    if np.count_nonzero(known) < weights.min_points:
-        return None
-    return _correlate(of_query[known], of_map[known], places[sampled][known], weights)
+    if len(shown) > 0:
+        shown = shown[sample_rows(len(shown))]
+    return ShownPoints(
+        places[shown], points.points_world[rows[shown]], points.node_ids[rows[shown]]
+    )
 
 
 def _is_shown(

@@ -23,8 +23,7 @@ from topoloc.geometry.absolute_pose import (
 )
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.localization.answer import Answer, Finding, lead
-from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.answer import Answer, Finding
 from topoloc.localization.exact.patch_alignment import (
     LastStepWeights,
     PreciseMatches,
@@ -34,7 +33,6 @@ from topoloc.localization.exact.patch_alignment import (
 from topoloc.localization.guided import match_guided
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.pose_fit import LocalMap
-from topoloc.localization.result import Localization
 from topoloc.localization.search import Search
 
 
@@ -62,46 +60,6 @@ def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
         and not first.query.deadline.is_past
         and bool(first.query.grey.any())  # not so if only features are known
     )
-
-
-def look_again(query: MapQuery, answer: Answer) -> Finding | None:
-    """Look again at the hypotheses of a refusal, because one of them is nearly a pose.
-
-    In bad light few unguided matches agree with the right pose, but the guided ones of all nodes
-    and feature types crowd around their predictions. Those of a wrong pose do not. If a prior pose
-    limits the search, a similar place may stand there, and the refusal remains.
-    """
-    searches, weights = query.searches, load_last_step_weights()
-    if (
-        query.prior is not None
-        or isinstance(answer.result, Localization)
-        or answer.result.reason == "ambiguous"
-        or not _can_refine(searches, weights)
-    ):
-        return None
-    crowded, others = list[tuple[Hypothesis, Search]](), list[Hypothesis]()
-    for search in searches:
-        ordered = [search, *(other for other in searches if other is not search)]
-        for one in search.belief.hypotheses:
-            gain, is_near = 0.0, one.log_odds > weights.crowding.min_log_odds
-            if is_near and one.evidence.is_of_nodes:
-                around = Surroundings.at_pose(ordered, one.fit.pose.cam_from_world, weights)
-                gain = around.compute_gain(one.fit.pose.cam_from_world)
-            if gain > 0.0:
-                crowded.append((replace(one, log_odds=one.log_odds + gain), search))
-            else:
-                others.append(one)
-    if not crowded:
-        return None
-    best, search = max(crowded, key=lambda one: one[0].log_odds)
-    belief = Belief()
-    for one in [*(one for one, _ in crowded), *others]:
-        belief = belief.with_hypothesis(one, search.config.evidence, search.weights.rivals)
-    if belief.hypotheses[0] is not best:
-        return None
-    reconsidered = lead(replace(search, belief=belief))
-    text = "the matches of all nodes crowd around their predictions"
-    return Finding("second look", text, answer=reconsidered) if reconsidered.pose else None
 
 
 def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
@@ -223,35 +181,6 @@ class Surroundings:
                 return None
             cam_from_world = fit.pose.cam_from_world
         return fit
-
-    def compute_gain(self, cam_from_world: Rigid3) -> float:
-        """Return the log-odds to add to a pose around whose predictions the matches crowd.
-
-        Few chance matches within the search radius lie near their predictions. A place that shares
-        only a part with this one, such as another floor, has chance matches in other parts of the
-        view.
-        """
-        fit, weights = self.refine_by_key_points(cam_from_world), self.weights.crowding
-        if fit is None:
-            return 0.0
-        matches = self.match(fit.pose.cam_from_world, weights.radius_px, len(self.searches))
-        predicted = self.camera.img_from_cam(fit.pose.cam_from_world.apply(matches.points_world))
-        errors_px = np.linalg.norm(predicted - matches.points_img, axis=1)
-        is_near = errors_px < weights.near_px * self.camera.radius_scale
-        size, counts = [self.camera.width, self.camera.height], np.array(weights.cells)
-        columns, rows = np.clip(matches.points_img * counts / size, 0, counts - 1).astype(int).T
-        cells, num_cells = rows * counts[0] + columns, int(counts.prod())
-        totals = np.bincount(cells, minlength=num_cells)
-        is_full = totals >= weights.min_cell_matches
-        shares = np.bincount(cells, is_near, num_cells)[is_full] / totals[is_full]
-        if (
-            len(shares) < weights.min_full_cells  # a lone door looks like another one
-            or np.quantile(shares, weights.quantile) < weights.min_share
-        ):
-            return 0.0
-        share, expected = weights.chance_share, weights.chance_share * len(matches)
-        crowding = (np.count_nonzero(is_near) - expected) / np.sqrt((1.0 - share) * expected)
-        return float(weights.weight * crowding + weights.bias)
 
     def match(self, cam_from_world: Rigid3, radius_px: float, num_searches: int) -> PreciseMatches:
         """Match the key points of the first searches within a radius of the predicted pixels."""

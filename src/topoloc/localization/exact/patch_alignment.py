@@ -26,30 +26,6 @@ from topoloc.mapping.topomap import TopoNode
 from topoloc.recordings.frame import Image, to_grey
 
 
-class CrowdingWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the numbers of the second look at a refused pose with log-odds above `min_log_odds`.
-
-    Its matches are searched within `radius_px` (pixels of an image whose longer side is 640). Of
-    chance matches, `chance_share` lies within `near_px` of the prediction. The matches crowd by
-    the standard deviations above that. `weight` times the crowding plus `bias` is added to the
-    log-odds, if matches crowd in all parts of the view: at least `min_full_cells` of the `cells`
-    (columns, rows) have `min_cell_matches`, and the `quantile` of their shares near the prediction
-    is at least `min_share`.
-    """
-
-    min_log_odds: Finite
-    radius_px: Finite
-    near_px: Finite
-    chance_share: Finite
-    cells: tuple[int, int]
-    min_cell_matches: int
-    min_full_cells: int
-    quantile: Finite
-    min_share: Finite
-    weight: Finite
-    bias: Finite
-
-
 class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the numbers of the last step (`last_step.py`).
 
@@ -86,7 +62,6 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     max_correlated_error_share: Finite
     shared_error_slope: Finite
     slow_errors: tuple[Finite, Finite]
-    crowding: CrowdingWeights
 
 
 @cache
@@ -213,21 +188,9 @@ def align(
     """Align matches by correlation with the nodes' images. Matches that do not correlate are
     dropped. Of the error of a point, that along the ray of its node remains: its pixel in the
     node's image is where the patch was taken."""
-    sizes = np.array([one.image.shape for one in templates.templates]).reshape(-1, 2)
-    images = np.zeros((len(sizes), *sizes.max(axis=0, initial=1)), np.uint8)
-    for k, template in enumerate(templates.templates):
-        images[k, : sizes[k, 0], : sizes[k, 1]] = template.image
     points_world = matches.points_world
-    predicted, centres, warps = _compute_warps(points_world, cam_from_world, camera, templates)
-    pixels, correlations = np.empty_like(predicted), np.empty(len(predicted))
-
-    def align_band(first: int, last: int) -> None:
-        band = slice(first, last)
-        projected = templates.of_point[band], predicted[band], centres[band], warps[band]
-        numbers = weights.patch_px, reach_px, weights.min_patch_sigma
-        pixels[band], correlations[band] = align_patches(image, images, sizes, *projected, *numbers)
-
-    parallel_for_rows(align_band, len(predicted))
+    view = predict_patches(points_world, templates, cam_from_world, camera)
+    pixels, correlations = correlate(image, view, reach_px, weights)
     rows = np.flatnonzero(correlations > weights.correlations[0])
     sigmas = np.interp(correlations[rows], weights.correlations, weights.aligned_sigmas_px)
     found, rays = matches.select(rows), points_world[rows] - templates.origins[rows]
@@ -238,14 +201,27 @@ def align(
     )
 
 
-def _compute_warps(
+@dataclass(frozen=True, eq=False)
+class PredictedPatches:
+    """Hold the patches around points, as the nodes' images predict them.
+
+    `predicted` are pixels of the query, `centres` those of the nodes' images. `warps` is the
+    derivative of the second by the first on a plane that faces the node.
+    """
+
+    templates: PointTemplates
+    predicted: Float[np.ndarray, "n 2"]
+    centres: Float[np.ndarray, "n 2"]
+    warps: Float[np.ndarray, "n 2 2"]
+
+
+def predict_patches(
     points_world: Float[np.ndarray, "n 3"],
+    templates: PointTemplates,
     cam_from_world: Rigid3,
     camera: Camera,
-    templates: PointTemplates,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Return the pixel of each point in the query and in the node's image, and the derivative of
-    the second by the first on a plane that faces the node."""
+) -> PredictedPatches:
+    """Return the patches of points."""
     in_query, in_node = cam_from_world.apply(points_world), templates.in_nodes(points_world)
     # short enough for the derivative of any lens
     steps = 0.01 * in_node[:, 2:] * np.eye(3)[:2, None]
@@ -256,7 +232,34 @@ def _compute_warps(
     (a, c), (b, d) = ((moved - predicted).T for moved in by_query)
     with np.errstate(divide="ignore", invalid="ignore"):  # a plane seen from its edge
         inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
-    return predicted, centres, np.einsum("jni,jkn->nik", by_node - centres, inverse)
+    warps = np.einsum("jni,jkn->nik", by_node - centres, inverse)
+    return PredictedPatches(templates, predicted, centres, warps)
+
+
+def correlate(
+    image: UInt8[np.ndarray, "h w"],
+    patches: PredictedPatches,
+    reach_px: int,
+    weights: LastStepWeights,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+    """Return the pixels where patches correlate best with an image, and the correlations as
+    `align_patches` does."""
+    templates, count = patches.templates, len(patches.predicted)
+    sizes = np.array([one.image.shape for one in templates.templates]).reshape(-1, 2)
+    images = np.zeros((len(sizes), *sizes.max(axis=0, initial=1)), np.uint8)
+    for k, template in enumerate(templates.templates):
+        images[k, : sizes[k, 0], : sizes[k, 1]] = template.image
+    pixels, correlations = np.empty((count, 2)), np.empty(count)
+
+    def align_band(first: int, last: int) -> None:
+        band = slice(first, last)
+        of_point, predicted = templates.of_point[band], patches.predicted[band]
+        projected = of_point, predicted, patches.centres[band], patches.warps[band]
+        numbers = weights.patch_px, reach_px, weights.min_patch_sigma
+        pixels[band], correlations[band] = align_patches(image, images, sizes, *projected, *numbers)
+
+    parallel_for_rows(align_band, count)
+    return pixels, correlations
 
 
 # Numba kernels
@@ -360,12 +363,13 @@ def align_patches(
     min_sigma,
 ):
     """Return the pixel of each match in `image` at which the patch around `centres` in its template
-    correlates best, at most `reach_px` from `predicted`, and the correlation (-1: none).
+    correlates best, at most `reach_px` from `predicted`, and the correlation: -1 if it is best at
+    the border of the search, NaN if a patch is outside or has no texture.
 
     `sizes` are the heights and widths of `templates`, `warps` the derivatives of a template's
     pixel by the image's. The patch has an odd side, and grey levels that vary by `min_sigma`.
     """
-    pixels, correlations = np.full((len(predicted), 2), np.nan), np.full(len(predicted), -1.0)
+    pixels, correlations = np.full((len(predicted), 2), np.nan), np.full(len(predicted), np.nan)
     patch = np.zeros((patch_px, patch_px), np.float32)
     scores = np.zeros((2 * reach_px + 1, 2 * reach_px + 1), np.float32)
     margin, last = patch_px // 2 + reach_px, 2 * reach_px
@@ -386,6 +390,7 @@ def align_patches(
         _correlate(patch, squares, window, min_squares, scores)
         best = np.argmax(scores)
         j, i = best // (last + 1), best % (last + 1)
+        correlations[k] = -1.0
         if 0 < i < last and 0 < j < last:
             dx, dy = _find_peak(scores, i, j)
             pixels[k, 0], pixels[k, 1] = x + i - reach_px + dx, y + j - reach_px + dy

@@ -1,0 +1,187 @@
+"""Weigh poses that are not clear by the pixels of all points in view.
+
+Key points change with the view and the light, and those of a pose agree by its choice. So the
+patches of all points that the image must show are correlated with the images of their nodes, at
+their predicted pixels and, for control, a third of the image away. At a right pose many correlate,
+fewer from another direction. In another place few do. In a place that looks alike, such as another
+floor, many do, so pixels weigh a pose against "not in the map" only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from msgspec import Struct
+
+from topoloc.errors import FeatureTypeError
+from topoloc.json_data import Finite, decode_json
+from topoloc.localization.answer import Answer, Finding, lead
+from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.exact.appearance import select_shown_points
+from topoloc.localization.exact.patch_alignment import (
+    correlate,
+    load_last_step_weights,
+    predict_patches,
+)
+from topoloc.localization.map_query import MapQuery
+from topoloc.localization.result import NotLocalized
+from topoloc.localization.search import Search
+
+
+class PixelWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the fitted weights of the pixels.
+
+    - Of each feature type, `max_hypotheses` with log-odds above `min_log_odds` are weighed. At
+      least `min_points` points must have texture. A patch is found if it correlates by
+      `min_correlation` within `reach_px` of its predicted pixel.
+    - The log-odds are `place` times those of the place (`FittedWeights.place_log_odds`), `found`
+      times the logarithm of the share of found patches, less the share by chance, `angle` times
+      the median angle between the rays of the node and of the camera to a point (radians, at most
+      `max_angle`), and `bias`. They differ by `max_gain` or `max_loss` from those without pixels.
+    """
+
+    corpus: str
+    date: str
+    command: str
+    max_hypotheses: int
+    min_log_odds: Finite
+    min_points: int
+    min_correlation: Finite
+    reach_px: int
+    place: Finite
+    found: Finite
+    angle: Finite
+    max_angle: Finite
+    bias: Finite
+    max_gain: Finite
+    max_loss: Finite
+
+
+@cache
+def load_pixel_weights() -> PixelWeights:
+    """Return the shipped weights. Raises FeatureTypeError: the file is damaged."""
+    path = Path(__file__).parent / "pixels.json"
+    return decode_json(path.read_bytes(), PixelWeights, FeatureTypeError, str(path))
+
+
+@dataclass(frozen=True)
+class PixelAgreement:
+    """Hold how the pixels around points in view agree with the nodes' images.
+
+    `found` and `by_chance` are shares of the patches with texture, at their predicted pixels and a
+    third of the image away. `angle` (radians) is the median change of the viewing direction.
+    """
+
+    found: float
+    by_chance: float
+    angle: float
+
+    def inputs(self, weights: PixelWeights) -> tuple[float, float]:
+        """Return the inputs of the regression."""
+        # finite without any patch found
+        found = math.log(max(self.found - self.by_chance, 0.0) + 0.01)
+        return found, min(self.angle, weights.max_angle)
+
+    def log_odds(self, place_log_odds: float, weights: PixelWeights) -> float:
+        """Return the log-odds of a pose with these log-odds of its place."""
+        found, angle = self.inputs(weights)
+        of_place = weights.place * place_log_odds
+        return of_place + weights.found * found + weights.angle * angle + weights.bias
+
+
+def measure_pixels(search: Search, hypothesis: Hypothesis) -> PixelAgreement | None:
+    """Compare the pixels around the points in view. None: too few points have texture."""
+    weights, last_step = load_pixel_weights(), load_last_step_weights()
+    camera, world_from_cam = hypothesis.fit.camera, hypothesis.world_from_cam
+    shown = select_shown_points(search, hypothesis.fit.node_id, world_from_cam, camera)
+    if len(shown.places) < weights.min_points:
+        return None
+    templates, grey = search.templates(shown.node_ids), search.query.grey
+    points = shown.points_world
+    patches = predict_patches(points, templates, world_from_cam.inverse(), camera)
+    size = np.array([camera.width, camera.height])
+    moved = replace(patches, predicted=np.mod(patches.predicted + size / 3.0, size))
+    there, elsewhere = (
+        correlate(grey, one, weights.reach_px, last_step)[1] for one in (patches, moved)
+    )
+    has_texture = np.isfinite(there)
+    if np.count_nonzero(has_texture) < weights.min_points:
+        return None
+    rays = points - templates.origins, points - world_from_cam.translation
+    lengths = np.prod([np.linalg.norm(one, axis=1) for one in rays], axis=0)
+    angles = np.arccos(np.clip(np.sum(rays[0] * rays[1], axis=1) / lengths, -1.0, 1.0))
+    found, by_chance = (
+        float(np.mean(one[np.isfinite(one)] > weights.min_correlation)) if len(one) else 0.0
+        for one in (there, elsewhere)
+    )
+    return PixelAgreement(found, by_chance, float(np.median(angles[has_texture])))
+
+
+def weigh_pixels(query: MapQuery, answer: Answer) -> Finding | None:
+    """Weigh the pose of an answer that is not clear, or the hypotheses of a refusal, by pixels.
+
+    If a prior pose limits the search, a similar place may stand there, and the refusal remains. If
+    feature types find different poses, it remains as well.
+    """
+    first, pose, best = query.searches[0], answer.pose, answer.best
+    if query.prior is not None or first.query.deadline.is_past or not first.query.grey.any():
+        return None
+    if isinstance(answer.result, NotLocalized) and answer.result.reason == "ambiguous":
+        return None
+    if pose is not None and best is not None:
+        weights = answer.search.weights.for_evidence(best.evidence)
+        if not best.evidence.is_of_nodes or weights.is_clear(best.log_odds):
+            return None
+    with first.query.clock.stage("pixels"):
+        asked = query.searches if pose is None else [answer.search]
+        looked = [found for search in asked if (found := _weigh(search)) is not None]
+    if not looked:
+        return None
+    found, text = max(looked, key=lambda one: one[0].pose.probability if one[0].pose else 0.0)
+    poses = [one.pose.world_from_cam for one, _ in looked if one.pose is not None]
+    config = first.config.evidence
+    max_rotation = 2.0 * math.radians(config.max_rotation_deg)
+    if not all(poses[0].is_same(one, 2.0 * config.max_translation, max_rotation) for one in poses):
+        return Finding("pixels", f"{text}, but feature types disagree")
+    return Finding("pixels", text, answer=found if found.pose or pose else None)
+
+
+def _weigh(search: Search) -> tuple[Answer, str] | None:
+    """Return the answer of a search by pixels and the text of its likeliest hypothesis. None: there
+    is nothing to weigh."""
+    weights, all_hypotheses = load_pixel_weights(), search.belief.hypotheses
+    looked = list[tuple[Hypothesis, float, str]]()
+    for one in search.belief.of_nodes:
+        if one.log_odds > weights.min_log_odds and len(looked) < weights.max_hypotheses:
+            agreement = measure_pixels(search, one)
+            if agreement is None:
+                continue
+            log_odds = agreement.log_odds(search.weights.place_log_odds(one.evidence), weights)
+            gain = float(np.clip(log_odds - one.log_odds, -weights.max_loss, weights.max_gain))
+            text = f"pixels of {agreement.found:.0%} of the points in view agree"
+            text = f"{text}, {agreement.by_chance:.0%} by chance, seen"
+            text = f"{text} {math.degrees(agreement.angle):.0f} degrees aside"
+            text = f"{text}: log odds {one.log_odds:.1f} -> {one.log_odds + gain:.1f}"
+            looked.append((one, gain, text))
+    if not looked:
+        return None
+    gains = {id(one): gain for one, gain in _keep_apart([(one, gain) for one, gain, _ in looked])}
+    belief = Belief()
+    for one in all_hypotheses:
+        weighed = replace(one, log_odds=one.log_odds + gains.get(id(one), 0.0))
+        belief = belief.with_hypothesis(weighed, search.config.evidence, search.weights.rivals)
+    text = max(looked, key=lambda one: one[0].log_odds + one[1])[2]
+    return lead(replace(search, belief=belief)), text
+
+
+def _keep_apart(looked: Sequence[tuple[Hypothesis, float]]) -> list[tuple[Hypothesis, float]]:
+    """Return the gains. Poses that all pass get the least one, for pixels do not tell them
+    apart."""
+    passing = [gain for one, gain in looked if one.log_odds + gain > 0.0]
+    least = min(passing, default=0.0)
+    return [(one, least if one.log_odds + gain > 0.0 else gain) for one, gain in looked]
