@@ -11,7 +11,7 @@ over the root of the covariance's trace: 0.89 if the covariance is exact. `insid
 within their 95 % ellipsoid, `TOO FEW` if that is significantly (5 %) below 95 %. `wrong`: beyond
 0.25 m or D degrees (default 2). Last, all recordings together. `--vary` prints a row for each value
 of a number of `exact/weights.json` (JSON, such as `max_errors_px=[8,3],[8,4]` or
-`crowding.weight=0.3,0.4`), while the others stay.
+`max_aligned=500,1000`), while the others stay.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ def main() -> None:
     asking.add_argument("--map-from-truth", type=Path)
     fitting = commands.add_parser("fit")
     fitting.add_argument("files", nargs="+", type=Path)
-    fitting.add_argument("--floors", type=float, default=0.3)
+    fitting.add_argument("--floors", type=float, default=0.6)
     arguments = parser.parse_args()
     if arguments.command == "ask":
         ask(arguments)
@@ -116,6 +116,7 @@ def describe(query: MapQuery, truth: Rigid3 | None) -> list[dict[str, Any]]:
                     "found": agreement.found,
                     "by_chance": agreement.by_chance,
                     "angle": agreement.angle,
+                    "colours": agreement.colours,
                 }
             )
     return rows
@@ -146,8 +147,8 @@ def fit(rows: list[dict[str, Any]], floor_weight: float) -> None:
         shrinkage = 0.3 * float(np.sum(line[:-1] ** 2))
         return float(np.sum(shares * np.logaddexp(0.0, -signs * (inputs @ line)))) + shrinkage
 
-    line = minimize(loss, np.zeros(4), method="BFGS").x
-    names = ("place", "found", "angle", "bias")
+    line = minimize(loss, np.zeros(5), method="BFGS").x
+    names = ("place", "found", "angle", "colours", "bias")
     print(json.dumps(dict(zip(names, np.round(line, 2).tolist(), strict=True))))
     print(f"{np.sum(shares > 0)} poses, {loss(line) / shares.sum():.4f} nats each")
     log_odds = np.array([one["log_odds"] for one in rows])
@@ -164,10 +165,10 @@ def fit(rows: list[dict[str, Any]], floor_weight: float) -> None:
         )
 
 
-def of_pixels(row: dict[str, Any]) -> tuple[float, float]:
+def of_pixels(row: dict[str, Any]) -> tuple[float, float, float]:
     """Return the inputs of the regression."""
-    agreement = PixelAgreement(row["found"], row["by_chance"], row["angle"])
-    return agreement.inputs(load_pixel_weights())
+    names = ("found", "by_chance", "angle", "colours")
+    return PixelAgreement(*(row[name] for name in names)).inputs(load_pixel_weights())
 
 
 if __name__ == "__main__":

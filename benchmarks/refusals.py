@@ -119,7 +119,7 @@ def ask(localizer: Localizer, frame: StereoFrame) -> Answer:
     by = [f"{k.source}:{k.features}" for k in tried if k.hypothesis.evidence == result.evidence]  # pyright: ignore[reportOptionalMemberAccess]
     return answer | {
         "kind": "by nodes" if result.is_of_nodes else "by virtual views",
-        "by": by[0] if by else "second look or other types",
+        "by": by[0] if by else "pixels or other types",
         "probability": result.probability,
         "position": result.world_from_cam.translation.tolist(),
         "error_m": error_of(result.world_from_cam, frame)[0],

@@ -18,7 +18,6 @@ from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.exact import last_step, patch_alignment
-from topoloc.localization.exact.last_step import Surroundings
 from topoloc.localization.exact.patch_alignment import (
     NodeTemplate,
     PointTemplates,
@@ -26,7 +25,6 @@ from topoloc.localization.exact.patch_alignment import (
     load_last_step_weights,
 )
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Trace
 from topoloc.mapping.mapping_frames import encode_small
@@ -78,23 +76,6 @@ def test_a_pose_that_cannot_be_aligned_keeps_the_shared_errors_of_its_first_one(
     shared = (1.0 - first.noise_share) * first.covariance
     assert np.linalg.eigvalsh(found.covariance - shared)[0] > -1e-12
     assert aligned.position_sigma_m < found.position_sigma_m
-
-
-def test_the_second_look_needs_matches_in_most_parts_of_the_view(
-    room: TopoMetricMap,
-):
-    """A strip of the image, like a door of another place, is no evidence for the whole view."""
-    image, truth = unseen_views(step=0.75)[0]
-    strip = image.copy()
-    strip[:, image.shape[1] // 2 :] = 128
-    gains = list[float]()
-    for shown in (image, strip):
-        context, query = Localizer(room).context, QueryImage(shown, CAMERA)
-        searches = context.searches(query, StageClock(), Deadline())
-        around = Surroundings.at_pose(searches, truth.inverse(), load_last_step_weights())
-        gains.append(around.compute_gain(truth.inverse()))
-    assert gains[0] > 0.0
-    assert gains[1] == 0.0
 
 
 def test_strong_distortion_is_part_of_the_warp(room: TopoMetricMap):
@@ -162,7 +143,7 @@ def test_a_shifted_patch_is_found_to_a_tenth_of_a_pixel(shift: tuple[float, floa
     )
     assert np.abs(pixels[:2] - predicted[:2] - shift).max() < 0.1
     assert correlations[:2].min() > 0.98
-    assert correlations[2] == -1.0
+    assert np.isnan(correlations[2])
 
 
 def test_points_are_projected_and_coloured_by_the_node_of_each():
@@ -213,5 +194,5 @@ def test_a_patch_without_texture_matches_nothing():
         4,
         2.0,
     )
-    assert correlations[0] == -1.0
+    assert np.isnan(correlations[0])
     assert np.isnan(pixels).all()

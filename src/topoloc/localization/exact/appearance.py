@@ -9,7 +9,7 @@ are correlated, less a quadratic function of the pixel.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -26,7 +26,6 @@ from topoloc.localization.evidence import sample_rows
 from topoloc.localization.exact.patch_alignment import sample_colours, small_colours
 from topoloc.localization.guided import select_visible_points
 from topoloc.localization.map_query import MapQuery
-from topoloc.localization.result import Localization
 from topoloc.localization.search import Search
 from topoloc.node_ids import NodeId
 
@@ -62,6 +61,11 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     places_log_odds: tuple[Finite, Finite]
 
 
+SWAP_RED_AND_BLUE = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.75], [0.0, 1.0, -0.5]])
+"""Turns `small_colours` (a row) into those of the image with red and blue swapped."""
+_SWAP_GAIN, _SWAP_CORRELATION = 0.3, 0.5  # no image of these corpora is taken for a swapped one
+
+
 @cache
 def load_appearance_weights() -> AppearanceWeights:
     """Return the shipped weights. Raises FeatureTypeError: the file is damaged."""
@@ -72,38 +76,50 @@ def load_appearance_weights() -> AppearanceWeights:
 @dataclass(frozen=True)
 class ColourAgreement:
     """Hold the correlation of the colours, -1 to 1, the standard deviation of the change of
-    brightness, and that of the colours where it is less: in the image or in the map."""
+    brightness, and that of the colours where it is less: in the image or in the map. Red and blue
+    of the image may be swapped."""
 
     correlation: float
     light_change: float
     contrast: float
+    is_swapped: bool = False
 
-    def appearance(self, probability: float, weights: AppearanceWeights) -> float:
-        """Return `Localization.appearance` of a pose with this probability without it."""
+    def log_odds(self, weights: AppearanceWeights) -> float:
+        """Return the log-odds of this floor against another one."""
         correlation = min(max(self.correlation, -0.97), 0.97)
         log_odds = weights.agreement * math.atanh(correlation) + weights.light * self.light_change
         share = self.contrast**2 / (self.contrast**2 + weights.noise**2)
+        return share * (log_odds + weights.bias)
+
+    def appearance(self, probability: float, weights: AppearanceWeights) -> float:
+        """Return `Localization.appearance` of a pose with this probability without it."""
         known = min(max(probability, 0.5), 0.9999)
         least, slope = weights.clear_log_odds
         clear = slope * max(0.0, math.log(known / (1.0 - known)) - least)
-        return 1.0 / (1.0 + math.exp(-share * (log_odds + weights.bias) - clear))
+        return 1.0 / (1.0 + math.exp(-self.log_odds(weights) - clear))
 
 
-def compare_colours(search: Search, found: Localization, camera: Camera) -> ColourAgreement | None:
-    """Compare the colours of the points in view. None: an image is grey, or few points are."""
+def compare_colours(search: Search, points: ShownPoints) -> ColourAgreement | None:
+    """Compare the colours of the points in view. None: an image is grey, or few points are.
+
+    An image whose red and blue are swapped, as OpenCV reads it, is compared as if they were not.
+    """
     weights = load_appearance_weights()
     in_query = small_colours(search.query.image)
-    if in_query is None:
-        return None
-    points = select_shown_points(search, found.node_id, found.world_from_cam, camera)
-    if len(points.places) < weights.min_points:
+    if in_query is None or len(points.places) < weights.min_points:
         return None
     of_query = sample_colours(in_query, points.places)
     of_map = search.templates(points.node_ids).sample_colours(points.points_world)
     known = np.isfinite(of_map[:, 0])
     if np.count_nonzero(known) < weights.min_points:
         return None
-    return _correlate(of_query[known], of_map[known], points.places[known], weights)
+    compared = of_map[known], points.places[known], weights
+    found = _correlate(of_query[known], *compared)
+    swapped = _correlate(of_query[known] @ SWAP_RED_AND_BLUE, *compared)
+    if found is None or swapped is None:
+        return found
+    is_swapped = swapped.correlation > max(found.correlation + _SWAP_GAIN, _SWAP_CORRELATION)
+    return replace(swapped, is_swapped=True) if is_swapped else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +196,12 @@ def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
     found, best, search = answer.pose, answer.best, query.searches[0]
     if found is None or best is None or not search.query.grey.any():  # only features
         return None
-    with search.query.clock.stage("appearance"):
-        is_of_nodes = best.evidence.is_of_nodes
-        agreement = compare_colours(search, found, best.fit.camera) if is_of_nodes else None
+    agreement = None
+    if best.evidence.is_of_nodes:
+        with search.query.clock.stage("appearance"):
+            camera = best.fit.camera
+            points = select_shown_points(search, found.node_id, found.world_from_cam, camera)
+            agreement = compare_colours(search, points)
     appearance, has_look_alikes = None, search.map.topomap.config.look_alike_floors
     text = "no colours can be compared"
     if agreement is not None:
@@ -190,7 +209,11 @@ def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
         certainty = 0.0 if has_look_alikes else found.probability
         appearance = agreement.appearance(certainty, load_appearance_weights())
         text = f"the colours agree with this floor with a probability of {appearance:.2g}"
+        text += ", with red and blue of the image swapped" if agreement.is_swapped else ""
+    is_weighed = any(one.check == "pixels" and one.answer for one in answer.findings)
     share = share_of_this_floor(appearance, has_look_alikes)
+    if is_weighed and not has_look_alikes:
+        share = 1.0  # they were weighed with the pixels
     return Finding("colours", text, share, {"appearance": appearance})
 
 

@@ -4,7 +4,7 @@ Key points change with the view and the light, and those of a pose agree by its 
 patches of all points that the image must show are correlated with the images of their nodes, at
 their predicted pixels and, for control, a third of the image away. At a right pose many correlate,
 fewer from another direction. In another place few do. In a place that looks alike, such as another
-floor, many do, so pixels weigh a pose against "not in the map" only.
+floor, many do, but their colours differ. Pixels weigh a pose against "not in the map" only.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ from topoloc.errors import FeatureTypeError
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.answer import Answer, Finding, lead
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.exact.appearance import select_shown_points
+from topoloc.localization.exact.appearance import (
+    compare_colours,
+    load_appearance_weights,
+    select_shown_points,
+)
 from topoloc.localization.exact.patch_alignment import (
     correlate,
     load_last_step_weights,
@@ -42,7 +46,9 @@ class PixelWeights(Struct, frozen=True, forbid_unknown_fields=True):
     - The log-odds are `place` times those of the place (`FittedWeights.place_log_odds`), `found`
       times the logarithm of the share of found patches, less the share by chance, `angle` times
       the median angle between the rays of the node and of the camera to a point (radians, at most
-      `max_angle`), and `bias`. They differ by `max_gain` or `max_loss` from those without pixels.
+      `max_angle`), `colours` times those of the colours of the same points
+      (`ColourAgreement.log_odds`, at most `max_colours` either way, 0 for grey images), and
+      `bias`. They differ by `max_gain` or `max_loss` from those without pixels.
     """
 
     corpus: str
@@ -57,6 +63,8 @@ class PixelWeights(Struct, frozen=True, forbid_unknown_fields=True):
     found: Finite
     angle: Finite
     max_angle: Finite
+    colours: Finite
+    max_colours: Finite
     bias: Finite
     max_gain: Finite
     max_loss: Finite
@@ -75,23 +83,26 @@ class PixelAgreement:
 
     `found` and `by_chance` are shares of the patches with texture, at their predicted pixels and a
     third of the image away. `angle` (radians) is the median change of the viewing direction.
+    `colours` are the log-odds of the colours.
     """
 
     found: float
     by_chance: float
     angle: float
+    colours: float
 
-    def inputs(self, weights: PixelWeights) -> tuple[float, float]:
+    def inputs(self, weights: PixelWeights) -> tuple[float, float, float]:
         """Return the inputs of the regression."""
         # finite without any patch found
         found = math.log(max(self.found - self.by_chance, 0.0) + 0.01)
-        return found, min(self.angle, weights.max_angle)
+        colours = min(max(self.colours, -weights.max_colours), weights.max_colours)
+        return found, min(self.angle, weights.max_angle), colours
 
     def log_odds(self, place_log_odds: float, weights: PixelWeights) -> float:
         """Return the log-odds of a pose with these log-odds of its place."""
-        found, angle = self.inputs(weights)
-        of_place = weights.place * place_log_odds
-        return of_place + weights.found * found + weights.angle * angle + weights.bias
+        factors = weights.found, weights.angle, weights.colours
+        by_pixels = sum(w * x for w, x in zip(factors, self.inputs(weights), strict=True))
+        return weights.place * place_log_odds + by_pixels + weights.bias
 
 
 def measure_pixels(search: Search, hypothesis: Hypothesis) -> PixelAgreement | None:
@@ -119,7 +130,9 @@ def measure_pixels(search: Search, hypothesis: Hypothesis) -> PixelAgreement | N
         float(np.mean(one[np.isfinite(one)] > weights.min_correlation)) if len(one) else 0.0
         for one in (there, elsewhere)
     )
-    return PixelAgreement(found, by_chance, float(np.median(angles[has_texture])))
+    colours = compare_colours(search, shown)
+    by_colours = 0.0 if colours is None else colours.log_odds(load_appearance_weights())
+    return PixelAgreement(found, by_chance, float(np.median(angles[has_texture])), by_colours)
 
 
 def weigh_pixels(query: MapQuery, answer: Answer) -> Finding | None:
