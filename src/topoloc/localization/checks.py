@@ -18,6 +18,7 @@ from topoloc.localization.exact.last_step import refine_answer
 from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.image_calibration_check import SeenCamera, check_image_calibration
 from topoloc.localization.map_query import MapQuery
+from topoloc.localization.result import Localization
 
 
 def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
@@ -34,19 +35,27 @@ def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
     facts: dict[str, Any] = {"seen_camera": found.seen}
     if found.other is None:
         return Finding("camera", "the image agrees with its calibration", facts=facts)
+    factor = probability_within(search, best, found.other.belief)
     if found.doubt is not None:
         text = f"the calibration is doubtful: {found.doubt}"
         facts["calibration_doubt"] = found.doubt
+        factor *= _share_without_pixels(query, best, pose)
     else:
         angle_deg = float(np.rad2deg(np.linalg.norm(found.other.rotation)))
         text = f"the camera turned by {angle_deg:.2f} degrees during the image"
         facts["frame_rotation_deg"] = angle_deg
-    factor = probability_within(search, best, found.other.belief)
     refusal = None
     if factor * pose.probability < search.config.evidence.min_probability:
         refusal = ("too_few_inliers", text)
     by_image = _with_camera(best, found.other)
     return Finding("camera", text, factor, facts, by_image, refusal=refusal)
+
+
+def _share_without_pixels(query: MapQuery, best: Hypothesis, pose: Localization) -> float:
+    """Return the factor that takes back what pixels added: the doubted camera predicted them."""
+    known = (one for search in query.searches for one in search.belief.hypotheses)
+    before = next((one.probability for one in known if one.fit is best.fit), 1.0)
+    return min(1.0, before / pose.probability)
 
 
 def _with_camera(best: Hypothesis, other: SeenCamera) -> Hypothesis:

@@ -12,8 +12,9 @@ from doubled_room import twice
 from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
-from topoloc.localization import map_query
+from topoloc.localization import checks, map_query
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig
+from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.proposals import votes
 from topoloc.localization.result import Localization, NotLocalized
@@ -59,6 +60,8 @@ def test_votes_find_the_place_when_other_nodes_rank_first(
         assert translation_error(found.world_from_cam, truth) < 0.05
     assert "votes" in {one.source for one in trace.tried}
     monkeypatch.setattr(map_query, "propose_voted_places", lambda _: iter(()))
+    without_pixels = tuple(one for one in checks.CHECKS if one is not weigh_pixels)
+    monkeypatch.setattr(checks, "CHECKS", without_pixels)  # they recognise a pose with low odds
     lost = [localizer.localize(picture, CAMERA) for picture, _ in views]
     assert sum(isinstance(one, NotLocalized) for one in lost) >= len(views) // 2
 
