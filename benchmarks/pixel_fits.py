@@ -8,7 +8,8 @@ MAP_SEQ may be a map file. `ask` appends a line for each hypothesis of each imag
 those of its place, what pixels say, and whether it is right (within 0.25 m and 5 degrees) or wrong
 (beyond 0.5 m, a tenth of the distance of its points, or 10 degrees; all with `--elsewhere`). `fit`
 prints the weights for `exact/pixels.json` and a row for each group. Poses of other floors (group
-`floors`) count `--floors` times: pixels do not tell floors apart, colours do.
+`floors`) count `--floors` times: pixels do not tell floors apart, colours do. Groups whose name
+begins with `held` are not fitted.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import argparse
 import json
 import math
 from collections import defaultdict
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ from topoloc.localization.exact.pixel_evidence import (
     PixelAgreement,
     load_pixel_weights,
     measure_pixels,
+    select_unclear,
 )
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
@@ -98,27 +101,13 @@ def ask(arguments: argparse.Namespace) -> None:
 
 def describe(query: MapQuery, truth: Rigid3 | None) -> list[dict[str, Any]]:
     """Return the rows of the hypotheses that would be weighed."""
-    weights, rows = load_pixel_weights(), list[dict[str, Any]]()
+    rows = list[dict[str, Any]]()
     for search in query.searches:
-        for one in search.belief.of_nodes[: weights.max_hypotheses]:
-            if one.log_odds < weights.min_log_odds:
-                continue
-            agreement = measure_pixels(search, one)
-            if agreement is None:
-                continue
-            rows.append(
-                {
-                    "kind": search.map.kind.name,
-                    "right": is_right(one, truth),
-                    "log_odds": one.log_odds,
-                    "place": search.weights.place_log_odds(one.evidence),
-                    "doubt": one.evidence.doubt,
-                    "found": agreement.found,
-                    "by_chance": agreement.by_chance,
-                    "angle": agreement.angle,
-                    "colours": agreement.colours,
-                }
-            )
+        for one in select_unclear(search):
+            if (agreement := measure_pixels(search, one)) is not None:
+                place = search.weights.place_log_odds(one.evidence)
+                row = {"kind": search.map.kind.name, "right": is_right(one, truth)}
+                rows.append(row | {"log_odds": one.log_odds, "place": place} | asdict(agreement))
     return rows
 
 
@@ -136,7 +125,7 @@ def is_right(one: Hypothesis, truth: Rigid3 | None) -> bool | None:
 def fit(rows: list[dict[str, Any]], floor_weight: float) -> None:
     """Print the weights, and what they do with the poses of each group."""
     weights = load_pixel_weights()
-    rows = [one for one in rows if one["right"] is not None and one["log_odds"] < 4.5]
+    rows = [one for one in rows if one["right"] is not None]
     inputs = np.array([[one["place"], *of_pixels(one), 1.0] for one in rows])
     signs = np.array([1.0 if one["right"] else -1.0 for one in rows])
     shares = np.array([floor_weight if one["group"] == "floors" else 1.0 for one in rows])

@@ -42,6 +42,8 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. The
       log-odds of three places of a stream must exceed theirs by `places_log_odds`, and three times
       the mean of n places by this times the root of 3/n.
+    - An image is taken for one with red and blue swapped if its colours correlate by `swapped`
+      then, and by `swap_gain` more than as they are.
     """
 
     corpus: str
@@ -59,11 +61,14 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     clear_log_odds: tuple[Finite, Finite]
     floor_odds: tuple[Finite, Finite]
     places_log_odds: tuple[Finite, Finite]
+    swapped: Finite
+    swap_gain: Finite
 
 
-SWAP_RED_AND_BLUE = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.75], [0.0, 1.0, -0.5]])
+SWAP_RED_AND_BLUE: Float[np.ndarray, "3 3"] = np.array(
+    [[1.0, 0.0, 0.0], [0.0, 0.5, 0.75], [0.0, 1.0, -0.5]]
+)
 """Turns `small_colours` (a row) into those of the image with red and blue swapped."""
-_SWAP_GAIN, _SWAP_CORRELATION = 0.3, 0.5  # no image of these corpora is taken for a swapped one
 
 
 @cache
@@ -115,11 +120,13 @@ def compare_colours(search: Search, points: ShownPoints) -> ColourAgreement | No
         return None
     compared = of_map[known], points.places[known], weights
     found = _correlate(of_query[known], *compared)
-    swapped = _correlate(of_query[known] @ SWAP_RED_AND_BLUE, *compared)
-    if found is None or swapped is None:
+    if found is None or found.correlation + weights.swap_gain >= 1.0:
         return found
-    is_swapped = swapped.correlation > max(found.correlation + _SWAP_GAIN, _SWAP_CORRELATION)
-    return replace(swapped, is_swapped=True) if is_swapped else found
+    swapped = _correlate(of_query[known] @ SWAP_RED_AND_BLUE, *compared)
+    least = max(found.correlation + weights.swap_gain, weights.swapped)
+    if swapped is None or swapped.correlation <= least:
+        return found
+    return replace(swapped, is_swapped=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,10 +217,7 @@ def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
         appearance = agreement.appearance(certainty, load_appearance_weights())
         text = f"the colours agree with this floor with a probability of {appearance:.2g}"
         text += ", with red and blue of the image swapped" if agreement.is_swapped else ""
-    is_weighed = any(one.check == "pixels" and one.answer for one in answer.findings)
     share = share_of_this_floor(appearance, has_look_alikes)
-    if is_weighed and not has_look_alikes:
-        share = 1.0  # they were weighed with the pixels
     return Finding("colours", text, share, {"appearance": appearance})
 
 

@@ -104,6 +104,26 @@ class PixelAgreement:
         by_pixels = sum(w * x for w, x in zip(factors, self.inputs(weights), strict=True))
         return weights.place * place_log_odds + by_pixels + weights.bias
 
+    def explain(self, log_odds: float, gain: float) -> str:
+        """Return the text of the finding about a pose with these log-odds."""
+        return (
+            f"pixels of {self.found:.0%} of the points in view agree, {self.by_chance:.0%} by"
+            f" chance, seen {math.degrees(self.angle):.0f} degrees aside: log odds"
+            f" {log_odds:.1f} -> {log_odds + gain:.1f}"
+        )
+
+
+def select_unclear(search: Search) -> list[Hypothesis]:
+    """Return the likeliest hypotheses of nodes that are not clear, at most `max_hypotheses`."""
+    weights = load_pixel_weights()
+    unclear = [
+        one
+        for one in search.belief.of_nodes
+        if one.log_odds > weights.min_log_odds
+        and not search.weights.for_evidence(one.evidence).is_clear(one.log_odds)
+    ]
+    return unclear[: weights.max_hypotheses]
+
 
 def measure_pixels(search: Search, hypothesis: Hypothesis) -> PixelAgreement | None:
     """Compare the pixels around the points in view. None: too few points have texture."""
@@ -127,7 +147,7 @@ def measure_pixels(search: Search, hypothesis: Hypothesis) -> PixelAgreement | N
     lengths = np.prod([np.linalg.norm(one, axis=1) for one in rays], axis=0)
     angles = np.arccos(np.clip(np.sum(rays[0] * rays[1], axis=1) / lengths, -1.0, 1.0))
     found, by_chance = (
-        float(np.mean(one[np.isfinite(one)] > weights.min_correlation)) if len(one) else 0.0
+        np.count_nonzero(one > weights.min_correlation) / max(np.count_nonzero(np.isfinite(one)), 1)
         for one in (there, elsewhere)
     )
     colours = compare_colours(search, shown)
@@ -167,25 +187,19 @@ def weigh_pixels(query: MapQuery, answer: Answer) -> Finding | None:
 def _weigh(search: Search) -> tuple[Answer, str] | None:
     """Return the answer of a search by pixels and the text of its likeliest hypothesis. None: there
     is nothing to weigh."""
-    weights, all_hypotheses = load_pixel_weights(), search.belief.hypotheses
+    weights = load_pixel_weights()
     looked = list[tuple[Hypothesis, float, str]]()
-    for one in search.belief.of_nodes:
-        if one.log_odds > weights.min_log_odds and len(looked) < weights.max_hypotheses:
-            agreement = measure_pixels(search, one)
-            if agreement is None:
-                continue
+    for one in select_unclear(search):
+        agreement = measure_pixels(search, one)
+        if agreement is not None:
             log_odds = agreement.log_odds(search.weights.place_log_odds(one.evidence), weights)
             gain = float(np.clip(log_odds - one.log_odds, -weights.max_loss, weights.max_gain))
-            text = f"pixels of {agreement.found:.0%} of the points in view agree"
-            text = f"{text}, {agreement.by_chance:.0%} by chance, seen"
-            text = f"{text} {math.degrees(agreement.angle):.0f} degrees aside"
-            text = f"{text}: log odds {one.log_odds:.1f} -> {one.log_odds + gain:.1f}"
-            looked.append((one, gain, text))
+            looked.append((one, gain, agreement.explain(one.log_odds, gain)))
     if not looked:
         return None
     gains = {id(one): gain for one, gain in _keep_apart([(one, gain) for one, gain, _ in looked])}
     belief = Belief()
-    for one in all_hypotheses:
+    for one in search.belief.hypotheses:
         weighed = replace(one, log_odds=one.log_odds + gains.get(id(one), 0.0))
         belief = belief.with_hypothesis(weighed, search.config.evidence, search.weights.rivals)
     text = max(looked, key=lambda one: one[0].log_odds + one[1])[2]
