@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.exact import appearance
+from topoloc.localization.exact import appearance, pixel_evidence
 from topoloc.localization.exact.appearance import (
     AppearanceWeights,
     ColourAgreement,
@@ -81,7 +81,7 @@ def ask(map_file: str, recordings: list[str], arguments: argparse.Namespace) -> 
         seen.append(compare(*given))
         return seen[-1]
 
-    appearance.compare_colours = keep
+    appearance.compare_colours = pixel_evidence.compare_colours = keep
     localizer = Localizer(map_file)
     for recording in recordings:
         sequence = open_sequence(recording)
@@ -93,8 +93,9 @@ def ask(map_file: str, recordings: list[str], arguments: argparse.Namespace) -> 
             found = localizer.localize(frame.image, frame.camera)
             if isinstance(found, Localization):
                 row |= {"p": found.probability, "pose": found.world_from_cam.to_json()}
-            if isinstance(found, Localization) and seen and seen[-1] is not None:
-                row["seen"] = [seen[-1].correlation, seen[-1].light_change, seen[-1].contrast]
+            if isinstance(found, Localization) and seen and seen[0] is not None:
+                row["with_pixels"] = found.appearance is None
+                row["seen"] = [seen[0].correlation, seen[0].light_change, seen[0].contrast]
             with arguments.out.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
 
@@ -156,7 +157,7 @@ def count(groups: list[list[Row]], weights: AppearanceWeights) -> list[int]:
 
 
 def _log_odds(row: Row, odds: float, weights: AppearanceWeights) -> float | None:
-    if "seen" not in row:
+    if "seen" not in row or (row["with_pixels"] and odds < 1.0):
         return None
     certainty = 0.0 if odds >= 1.0 else row["p"]  # as `weigh_appearance`
     seen = ColourAgreement(*row["seen"]).appearance(certainty, weights)

@@ -58,7 +58,7 @@ def main() -> None:
     asking.add_argument("--map-from-truth", type=Path)
     fitting = commands.add_parser("fit")
     fitting.add_argument("files", nargs="+", type=Path)
-    fitting.add_argument("--floors", type=float, default=0.6)
+    fitting.add_argument("--floors", type=float, default=1.0)
     arguments = parser.parse_args()
     if arguments.command == "ask":
         ask(arguments)

@@ -15,9 +15,12 @@ from made_once import once_a_run
 from topoloc.apps.cli import main
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.exact.appearance import SWAP_RED_AND_BLUE
+from topoloc.localization.exact.patch_alignment import small_colours
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.search import Trace
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoFrame, to_grey
@@ -191,3 +194,47 @@ def test_a_map_of_grey_images_cannot_distinguish_floors_and_stays(
     assert f"map {path} has no colours" in said
     assert f"`topoloc update {path} SEQ`" in said
     assert path.read_bytes() == room_map.read_bytes()
+
+
+def test_swapped_colours_follow_from_those_of_the_image():
+    image = np.random.default_rng(0).integers(0, 250, (60, 80, 3), np.uint8)
+    found, swapped = small_colours(image), small_colours(image[:, :, ::-1].copy())
+    assert found is not None
+    assert swapped is not None
+    assert np.allclose(found @ SWAP_RED_AND_BLUE, swapped, atol=1e-5)
+
+
+def _tinted(image: np.ndarray, name: str) -> np.ndarray:
+    """Return the image with another white balance, or in the tones of sepia."""
+    by_channel = {"red": np.diag([1.4, 1.0, 0.6]), "blue": np.diag([0.6, 1.0, 1.4])}
+    sepia = np.array([[0.393, 0.769, 0.189], [0.349, 0.686, 0.168], [0.272, 0.534, 0.131]])
+    return np.clip(image @ by_channel.get(name, sepia).T, 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", ["red", "blue", "sepia"])
+def test_a_false_white_balance_and_sepia_refuse_nobody(lab: TopoMetricMap, name: str):
+    for found in _ask(lab, [_tinted(frame.image, name) for frame in _unseen()[:4]]):
+        assert isinstance(found, Localization)
+        assert found.probability > 0.9
+        assert (found.appearance is None) == (name == "sepia")
+
+
+def test_swapped_red_and_blue_are_told(lab: TopoMetricMap):
+    localizer = Localizer(lab)
+    for frame in _unseen()[:4]:
+        trace = Trace()
+        image = np.ascontiguousarray(frame.image[:, :, ::-1])
+        found = localizer.localize(image, frame.camera, trace=trace)
+        assert isinstance(found, Localization)
+        assert found.appearance is not None
+        assert found.appearance > 0.9
+        assert any("red and blue of the image swapped" in one.text for one in trace.findings)
+
+
+def test_white_walls_keep_their_colour_and_clipped_ones_have_none():
+    image = np.full((60, 80, 3), 100, np.uint8)
+    image[:30], image[30:, :40] = 255, (255, 255, 180)
+    colours = small_colours(image)
+    assert colours is not None
+    assert np.allclose(colours[:29, :, 1:], 0.0, atol=1e-6)
+    assert np.isnan(colours[31:, :39]).all()

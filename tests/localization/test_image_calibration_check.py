@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.camera import Camera
+from topoloc.localization import checks
+from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
@@ -60,6 +62,26 @@ def test_a_refusal_names_a_focal_length_that_is_far_off(localizer: Localizer, qu
     faults = ("the image asks for a focal length shorter than 520 px", "the picture says f = ")
     assert details
     assert all(any(fault in detail for fault in faults) for detail in details)
+
+
+def test_pixels_do_not_excuse_a_wrong_focal_length(
+    localizer: Localizer, queries: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def likely_wrong() -> int:
+        wrong = 0
+        for frame in open_sequence(queries):
+            assert frame.camera is not None
+            assert frame.world_from_cam is not None
+            found = localizer.localize(frame.image, with_focal(frame.camera, 2.0))
+            if isinstance(found, Localization):
+                error = frame.world_from_cam.inverse() @ found.world_from_cam
+                wrong += bool(np.linalg.norm(error.translation) > 0.25 and found.probability > 0.5)
+        return wrong
+
+    by_all = likely_wrong()
+    without_pixels = tuple(one for one in checks.CHECKS if one is not weigh_pixels)
+    monkeypatch.setattr(checks, "CHECKS", without_pixels)
+    assert by_all <= likely_wrong()
 
 
 @pytest.mark.parametrize("scale", [0.93, 1.08])

@@ -14,9 +14,9 @@ from tiny_world import CAMERA
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import Answer, lead
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.exact import appearance, patch_alignment
-from topoloc.localization.exact.patch_alignment import small_colours
+from topoloc.localization.exact import patch_alignment, pixel_evidence
 from topoloc.localization.exact.pixel_evidence import (
+    PixelAgreement,
     load_pixel_weights,
     measure_pixels,
     weigh_pixels,
@@ -80,10 +80,46 @@ def test_a_right_pose_with_low_odds_is_answered_and_explained(room: TopoMetricMa
     assert np.linalg.norm((pose.world_from_cam.inverse() @ truth).translation) < 0.02
 
 
-def test_the_gain_is_bounded(room: TopoMetricMap):
+def test_odds_far_below_are_not_weighed(room: TopoMetricMap):
     far_below = load_pixel_weights().min_log_odds - 0.1
     query, refused = _refused(room, unseen_views(step=0.75)[0][0], far_below)
     assert weigh_pixels(query, refused) is None
+
+
+@pytest.mark.parametrize("log_odds", [-5.9, 3.0])
+def test_pixels_change_the_odds_by_a_bounded_amount(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, log_odds: float
+):
+    weights = load_pixel_weights()
+    all_agree, none_do = PixelAgreement(1.0, 0.0, 0.4, 4.0), PixelAgreement(0.0, 0.2, 0.0, -4.0)
+    agreement = none_do if log_odds > 0.0 else all_agree
+    monkeypatch.setattr(pixel_evidence, "measure_pixels", lambda *given: agreement)
+    query, refused = _refused(room, unseen_views(step=0.75)[0][0], log_odds)
+    finding = weigh_pixels(query, refused)
+    assert finding is not None
+    bound = -weights.max_loss if log_odds > 0.0 else weights.max_gain
+    assert f"log odds {log_odds:.1f} -> {log_odds + bound:.1f}" in finding.text
+
+
+def test_pixels_do_not_tell_two_poses_apart(room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
+    query, _ = _refused(room, unseen_views(step=0.75)[0][0], -1.0)
+    search = query.searches[0]
+    best = search.belief.hypotheses[0]
+    other = _moved(best, 2.0)
+    search.belief = Belief((best, other))
+    shown = {id(best): 0.9, id(other): 0.4}
+    monkeypatch.setattr(
+        pixel_evidence,
+        "measure_pixels",
+        lambda _, one: PixelAgreement(shown[id(one)], 0.0, 0.3, 2.0),
+    )
+    finding = weigh_pixels(query, lead(search))
+    assert finding is not None
+    assert finding.answer is not None
+    odds = [one.log_odds for one in finding.answer.search.belief.all_hypotheses]
+    assert len(odds) == 2
+    assert odds[0] == pytest.approx(odds[1])
+    assert odds[0] > -1.0
 
 
 def test_without_images_of_the_nodes_a_refusal_remains(
@@ -97,11 +133,3 @@ def test_without_images_of_the_nodes_a_refusal_remains(
     )
     query, refused = _refused(room, unseen_views(step=0.75)[0][0], -2.0)
     assert weigh_pixels(query, refused) is None
-
-
-def test_swapped_colours_follow_from_those_of_the_image():
-    image = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)
-    found, swapped = small_colours(image), small_colours(image[:, :, ::-1].copy())
-    assert found is not None
-    assert swapped is not None
-    assert np.allclose(found @ appearance.SWAP_RED_AND_BLUE, swapped, atol=1e-5)

@@ -87,7 +87,8 @@ class Localization(_Result):
         seen_camera: calibration estimate of this image (`geometry/calibration_check.py`), or None.
         geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
         appearance: probability that the colours in view are this floor's and not another's, if both
-            were as likely. The probability includes it. None if the image or the map is grey.
+            were as likely. The probability includes it. None if the image or the map is grey, or if
+            colours were weighed with the pixels (`exact/pixel_evidence.py`).
     """
 
     world_from_cam: Rigid3

@@ -42,8 +42,8 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     - `floor_odds`: odds of another floor, in most maps and in maps with look-alike floors. The
       log-odds of three places of a stream must exceed theirs by `places_log_odds`, and three times
       the mean of n places by this times the root of 3/n.
-    - An image is taken for one with red and blue swapped if its colours correlate by `swapped`
-      then, and by `swap_gain` more than as they are.
+    - Red and blue of an image are swapped if the log-odds gain `swapped` then. An image is grey if
+      its brightness explains its colours but for `grey` times the noise.
     """
 
     corpus: str
@@ -62,7 +62,7 @@ class AppearanceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     floor_odds: tuple[Finite, Finite]
     places_log_odds: tuple[Finite, Finite]
     swapped: Finite
-    swap_gain: Finite
+    grey: Finite
 
 
 SWAP_RED_AND_BLUE: Float[np.ndarray, "3 3"] = np.array(
@@ -115,16 +115,16 @@ def compare_colours(search: Search, points: ShownPoints) -> ColourAgreement | No
         return None
     of_query = sample_colours(in_query, points.places)
     of_map = search.templates(points.node_ids).sample_colours(points.points_world)
-    known = np.isfinite(of_map[:, 0])
+    known = np.isfinite(of_query[:, 0] + of_map[:, 0])
     if np.count_nonzero(known) < weights.min_points:
         return None
     compared = of_map[known], points.places[known], weights
     found = _correlate(of_query[known], *compared)
-    if found is None or found.correlation + weights.swap_gain >= 1.0:
+    surely = 0.7  # no other colours correlate much better
+    if found is None or found.correlation > surely:
         return found
     swapped = _correlate(of_query[known] @ SWAP_RED_AND_BLUE, *compared)
-    least = max(found.correlation + weights.swap_gain, weights.swapped)
-    if swapped is None or swapped.correlation <= least:
+    if swapped is None or swapped.log_odds(weights) < found.log_odds(weights) + weights.swapped:
         return found
     return replace(swapped, is_swapped=True)
 
@@ -179,6 +179,8 @@ def _correlate(
     weights: AppearanceWeights,
 ) -> ColourAgreement | None:
     """Correlate `small_colours`. None: the image or the map is grey."""
+    if _is_grey(of_query, weights) or _is_grey(of_map, weights):
+        return None
     x, y = (2.0 * places - 1.0).T
     slow = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     both = np.column_stack([of_query[:, 1:], of_map[:, 1:]])
@@ -190,8 +192,15 @@ def _correlate(
     correlation = (products / np.sqrt((variances + least_variance).prod(axis=0))).mean()
     light_change = float(np.std(of_query[:, 0] - of_map[:, 0]))
     contrast = math.sqrt(variances.mean(axis=1).min())
-    is_grey = contrast < 0.2 * weights.noise
-    return None if is_grey else ColourAgreement(float(correlation), light_change, contrast)
+    return ColourAgreement(float(correlation), light_change, contrast)
+
+
+def _is_grey(colours: Float[np.ndarray, "n 3"], weights: AppearanceWeights) -> bool:
+    """Return whether the colours follow from the brightness, as those of grey and toned images."""
+    brightness = colours[:, 0] - colours[:, 0].mean()
+    tones = brightness[:, None] ** np.arange(4)
+    rest = colours[:, 1:] - tones @ np.linalg.lstsq(tones, colours[:, 1:], rcond=None)[0]
+    return float(np.sqrt(np.mean(rest**2))) < weights.grey * weights.noise
 
 
 def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
@@ -199,9 +208,14 @@ def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
     floor.
 
     Without colours nothing tells floors apart, and a map with look-alike floors is honest about it.
+    In other maps the odds include the colours if pixels weighed the pose.
     """
     found, best, search = answer.pose, answer.best, query.searches[0]
     if found is None or best is None or not search.query.grey.any():  # only features
+        return None
+    has_look_alikes = search.map.topomap.config.look_alike_floors
+    is_weighed = any(one.check == "pixels" and one.answer for one in answer.findings)
+    if is_weighed and not has_look_alikes:
         return None
     agreement = None
     if best.evidence.is_of_nodes:
@@ -209,8 +223,7 @@ def check_colours(query: MapQuery, answer: Answer) -> Finding | None:
             camera = best.fit.camera
             points = select_shown_points(search, found.node_id, found.world_from_cam, camera)
             agreement = compare_colours(search, points)
-    appearance, has_look_alikes = None, search.map.topomap.config.look_alike_floors
-    text = "no colours can be compared"
+    appearance, text = None, "no colours can be compared"
     if agreement is not None:
         # where floors look alike, a clear pose tells no floor
         certainty = 0.0 if has_look_alikes else found.probability
