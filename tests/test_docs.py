@@ -9,6 +9,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 from types import ModuleType
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ import topoloc.plugin
 from topoloc.apps.cli import all_commands, main
 from topoloc.evaluation.metrics import EvaluatedQuery, summarize
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import CandidateNode, Localization, NotLocalized
+from topoloc.localization.result import CandidateNode, Localization, NotLocalized, Reason
 from topoloc.mapping.storage import schema
 
 DOORS = (topoloc, topoloc.plugin)
@@ -83,10 +84,7 @@ def test_commands_in_code_blocks_exist(capsys: pytest.CaptureFixture[str]):
         assert used <= settings[command] | {"--help"}, call
 
 
-@pytest.mark.parametrize(
-    "reason",
-    ["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"],
-)
+@pytest.mark.parametrize("reason", get_args(Reason))
 def test_every_reason_is_documented(reason: str):
     assert f"`{reason}`" in _section(RESULTS, "Results")
 

@@ -341,7 +341,7 @@ def test_a_certain_but_imprecise_place_is_not_reported():
     assert isinstance(precise, Localization)
     assert precise.probability > 0.99
     assert isinstance(imprecise, NotLocalized)
-    assert imprecise.reason == "too_few_inliers"
+    assert imprecise.reason == "imprecise"
     assert imprecise.detail.startswith("in the map, but where is known to")
 
 

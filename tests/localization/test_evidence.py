@@ -117,13 +117,22 @@ def test_an_imprecise_pose_is_distinguished_from_one_without_evidence():
         even_share=0.08,
     )
     assert _probability(small, WEIGHTS) < CONFIG.min_probability
-    assert is_only_imprecise(small, WEIGHTS, CONFIG)
-    assert not is_only_imprecise(MANY_OF_VERY_MANY, WEIGHTS, CONFIG)
+    assert is_only_imprecise(small, WEIGHTS.log_odds(small), WEIGHTS, CONFIG)
+    assert not is_only_imprecise(
+        MANY_OF_VERY_MANY, WEIGHTS.log_odds(MANY_OF_VERY_MANY), WEIGHTS, CONFIG
+    )
 
 
 def test_indoors_less_is_tolerated():
-    assert compute_translation_tolerance(20.0, CONFIG) == 0.25
-    assert compute_translation_tolerance(2.0, CONFIG) == pytest.approx(0.1)
+    assert compute_translation_tolerance(20.0, 0.25) == 0.25
+    assert compute_translation_tolerance(2.0, 0.25) == pytest.approx(0.1)
+
+
+def test_a_wider_tolerance_forgives_a_lack_of_precision_but_proves_no_place():
+    wide = replace(CONFIG, tolerance=(0.5, 4.0))
+    for doubt, forgiven in ((1.0, 0.5), (0.4, 0.3), (0.2, 0.2)):
+        metres = np.diag([1e-9, (0.25 * doubt) ** 2, 1e-9, 1e-12, 1e-12, 1e-12])
+        assert compute_normalized_uncertainty(metres, 20.0, wide) == pytest.approx(forgiven, 1e-2)
 
 
 def test_normalized_uncertainty_is_one_at_the_tolerance_in_the_worst_direction():

@@ -166,9 +166,9 @@ def _weigh_camera(
 
 def probability_within(search: Search, best: Hypothesis, camera: CameraBelief) -> float:
     """Return the probability that a camera moves the pose by less than the tolerances."""
-    config = search.config.evidence
-    max_translation = compute_translation_tolerance(best.fit.median_depth, config)
-    return camera.probability_within(max_translation, math.radians(config.max_rotation_deg))
+    max_translation, max_rotation_deg = search.config.evidence.max_errors
+    max_translation = compute_translation_tolerance(best.fit.median_depth, max_translation)
+    return camera.probability_within(max_translation, math.radians(max_rotation_deg))
 
 
 def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
@@ -252,10 +252,8 @@ def _ambiguous_answer(search: Search, ranked: Sequence[Hypothesis], shares: list
     """Return an ambiguous answer with the probability of each alternative."""
     best, probable = ranked[0], select_probable(ranked, shares)
     named = [_build_localization(search, one, share) for one, share in probable]
-    alternatives = tuple(
-        Alternative(one.world_from_cam, one.probability, one.node_id) for one, _ in named
-    )
-    reason, detail = "too_few_inliers", _describe_imprecision(best)
+    alternatives = tuple(_alternative(one) for one, _ in named)
+    reason, detail = "imprecise", _describe_imprecision(best)
     if len(alternatives) > 1:
         first, second = alternatives[:2]
         reason = "ambiguous"
@@ -271,10 +269,17 @@ def _explain_not_localized(search: Search, best: Hypothesis | None) -> NotLocali
         is_enough = num_matches >= search.config.min_matches
         reason = "too_few_inliers" if is_enough else "too_few_matches"
         return _build_not_localized(search, reason, first)
-    if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
+    if is_only_imprecise(best.evidence, best.log_odds, search.weights, search.config.evidence):
+        pose = _alternative(_build_localization(search, best, best.probability)[0])
         detail = _describe_imprecision(best)
-        return _build_not_localized(search, "too_few_inliers", best.fit, detail)
+        return _build_not_localized(search, "imprecise", best.fit, detail, (pose,))
     return _build_not_localized(search, "not_in_map", best.fit, find_focal_doubt(search, best.fit))
+
+
+def _alternative(pose: Localization) -> Alternative:
+    return Alternative(
+        pose.world_from_cam, pose.probability, pose.node_id, covariance=pose.covariance
+    )
 
 
 def _describe_imprecision(best: Hypothesis) -> str:
@@ -304,8 +309,9 @@ def _build_not_localized(
 
 def refuse(search: Search, pose: Localization, reason: Reason, detail: str) -> NotLocalized:
     """Return the refusal of a pose."""
+    alternatives = (_alternative(pose),) if reason == "imprecise" else ()
     return replace(
-        _build_not_localized(search, reason, None, detail),
+        _build_not_localized(search, reason, None, detail, alternatives),
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
         provenance=pose.provenance,

@@ -70,9 +70,10 @@ def _with_camera(best: Hypothesis, other: SeenCamera) -> Hypothesis:
 
 
 def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:
-    """Refuse a pose whose probability is below the threshold of the map's certificate, or which
-    looks as on another floor."""
+    """Refuse a pose whose probability is below the threshold of the map's certificate, which
+    looks as on another floor, or which is less precise than the tolerance."""
     pose, certified = answer.pose, query.opened.topomap.certificate
+    config = query.opened.config.evidence
     if pose is None:
         return None
     least = 0.0 if certified is None else certified.applied_min_probability
@@ -80,11 +81,16 @@ def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:
         text = f"probability {pose.probability:.3g}, below the map's certified threshold"
         text = f"{text} {least:.3g}"
         return Finding("threshold", text, refusal=("too_few_inliers", text))
-    if pose.probability < query.opened.config.evidence.min_probability:
+    if pose.probability < config.min_probability:
         text = "without colours in view nothing tells the look-alike floors apart"
         if (seen := pose.appearance) is not None:
             text = f"the shape agrees, but not the colours, as on another floor ({seen:.2g})"
         return Finding("threshold", text, refusal=("not_in_map", text))
+    # those of the weights refuse no pose: covariances are upper bounds
+    sigmas, asked = (pose.position_sigma_m, pose.rotation_sigma_deg), config.tolerance
+    if asked is not None and (sigmas[0] > asked[0] or sigmas[1] > asked[1]):
+        text = "in the map, but where is known to {:.2f} m and {:.1f} degrees only".format(*sigmas)
+        return Finding("threshold", text, refusal=("imprecise", text))
     return None
 
 

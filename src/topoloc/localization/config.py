@@ -18,16 +18,24 @@ class EvidenceConfig:
     """Configure the tolerance of a right pose and the conditions for reporting one."""
 
     max_translation: ClassVar[float] = 0.25
-    """Maximum position error of a right pose, metres. `depth_share` of the distance of the seen
-    points replaces it if that is less."""
+    """Maximum position error of a right pose, metres, on which the weights were fitted.
+    `depth_share` of the distance of the seen points replaces it if that is less."""
     max_rotation_deg: ClassVar[float] = 2.0
-    """Maximum rotation error of a right pose, degrees."""
+    """Maximum rotation error of a right pose, degrees, on which the weights were fitted."""
+    tolerance: Annotated[tuple[float, float] | None, Between(1e-3, 1000)] = None
+    """Maximum errors of a right pose, metres and degrees, if other than those of the weights. A
+    pose with larger standard deviations is refused as `imprecise`."""
     min_inliers: Annotated[int, AtLeast(4)] = 5
     """Minimum number of inliers of a pose proposal. Proposals with fewer are not tested."""
     min_found: Annotated[int, AtLeast(4)] = 12
     """Minimum number of map points found at their predicted pixels."""
     min_probability: Annotated[float, Between(0, 1)] = 0.5
     """Minimum probability of a reported pose."""
+
+    @property
+    def max_errors(self) -> tuple[float, float]:
+        """Return the maximum errors of a right pose, metres and degrees."""
+        return self.tolerance or (self.max_translation, self.max_rotation_deg)
 
 
 @dataclass(frozen=True)

@@ -32,14 +32,16 @@ from topoloc.localization.search import Search
 
 _GRID = np.array([8, 6])
 """Grid of cells over the image. The inlier spread is the share of cells with an inlier."""
+_PRECISE_DOUBT = 0.3
+"""Doubt below which a pose is precise enough."""
 
 
-def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -> float:
+def compute_translation_tolerance(median_depth: float, max_translation: float) -> float:
     """Return the maximum position error (metres) of a right pose for points `median_depth` (metres)
     away."""
     # Maximum position error as a share of the median distance of the seen points.
-    depth_share = 0.05
-    return min(config.max_translation, depth_share * median_depth)
+    depth_share = 0.05 * max_translation / EvidenceConfig.max_translation
+    return min(max_translation, depth_share * median_depth)
 
 
 def compute_normalized_uncertainty(
@@ -47,16 +49,20 @@ def compute_normalized_uncertainty(
 ) -> float:
     """Compute `Evidence.doubt` from a covariance.
 
-    The covariance is that of the left perturbation of cam_from_world (metres, radians).
+    The covariance is that of the left perturbation of cam_from_world (metres, radians). A wider
+    tolerance forgives a lack of precision, and says nothing about the place.
     """
-    metres = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) / compute_translation_tolerance(
-        median_depth, config
+    metres, radians = (
+        math.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (covariance[:3, :3], covariance[3:, 3:])
     )
-    return math.hypot(
-        metres,
-        math.degrees(math.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
-        / config.max_rotation_deg,
+    fitted, asked = (
+        math.hypot(
+            metres / compute_translation_tolerance(median_depth, max_translation),
+            math.degrees(radians) / max_rotation_deg,
+        )
+        for max_translation, max_rotation_deg in (EvidenceConfig().max_errors, config.max_errors)
     )
+    return max(asked, min(fitted, _PRECISE_DOUBT))
 
 
 def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceConfig) -> float:
@@ -66,8 +72,9 @@ def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceCo
     no pose. The probability is 0.95 if a standard deviation equals its tolerance.
     """
     variances = np.diag(covariance)
-    metres = math.sqrt(variances[:3].sum()) / config.max_translation
-    degrees = math.degrees(math.sqrt(variances[3:].sum())) / config.max_rotation_deg
+    max_translation, max_rotation_deg = config.max_errors
+    metres = math.sqrt(variances[:3].sum()) / max_translation
+    degrees = math.degrees(math.sqrt(variances[3:].sum())) / max_rotation_deg
     normal_95_percent = 1.96
     within = probability_within_tolerance(max(metres, degrees) / normal_95_percent)
     return max(within, config.min_probability)
@@ -142,10 +149,17 @@ def _cells(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> Int
     return cells[:, 1] * _GRID[0] + cells[:, 0]
 
 
-def is_only_imprecise(evidence: Evidence, weights: FittedWeights, config: EvidenceConfig) -> bool:
-    """Return whether the pose would be accepted if it were more precise."""
-    log_odds = weights.log_odds(replace(evidence, doubt=min(evidence.doubt, 0.3)))
+def is_only_imprecise(
+    evidence: Evidence, log_odds: float, weights: FittedWeights, config: EvidenceConfig
+) -> bool:
+    """Return whether a pose with these log-odds would be accepted if it were more precise."""
+    log_odds += _log_odds_if_precise(evidence, weights) - weights.log_odds(evidence)
     return 1.0 / (1.0 + math.exp(-log_odds)) >= config.min_probability
+
+
+def _log_odds_if_precise(evidence: Evidence, weights: FittedWeights) -> float:
+    """Return the log-odds of a pose if it were precise enough."""
+    return weights.log_odds(replace(evidence, doubt=min(evidence.doubt, _PRECISE_DOUBT)))
 
 
 def compute_evidence(
@@ -183,14 +197,14 @@ def compute_evidence(
         if weights.evidence.is_clear(log_odds):
             return evidence
         may_be_hopeless = log_odds < 2.0 * hopeless
-    if weights.log_odds(_assume_all_agree(counted, final)) < hopeless:  # for any unguided matches
-        return None
+    if _log_odds_if_precise(_assume_all_agree(counted, final), weights) < hopeless:
+        return None  # for any unguided matches
     matcher = create_unguided_matcher(search, final)
     if may_be_hopeless:
         strongest = _unguided(final, matcher.match_first(search.config.num_first_features))
         of_strongest = _with_unguided(search, counted, strongest, final)
-        if weights.log_odds(of_strongest) < 2.0 * hopeless:  # for any matches of other features
-            return None
+        if _log_odds_if_precise(of_strongest, weights) < 2.0 * hopeless:
+            return None  # for any matches of other features
     return _with_unguided(search, counted, _unguided(final, matcher.match_first()), final)
 
 

@@ -22,7 +22,13 @@ from topoloc.node_ids import NodeId
 Share = Annotated[float, Meta(ge=0, le=1)]
 _NodeId = Annotated[NodeId, Meta(ge=0, lt=2**53)]
 Reason = Literal[
-    "too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"
+    "too_few_matches",
+    "too_few_inliers",
+    "imprecise",
+    "ambiguous",
+    "not_in_map",
+    "jump",
+    "unreadable",
 ]
 
 
@@ -175,10 +181,12 @@ class Localization(_Result):
 
 
 class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "node"}):
-    """Hold one possible pose of an ambiguous image and its probability.
+    """Hold one possible pose of an ambiguous image, or that of an imprecise one, and its
+    probability.
 
     The probabilities of all alternatives sum to less than 1. The rest is the probability of none of
-    them. `geopose` is as in `Localization`. `tile` is the atlas tile in whose world the pose is.
+    them. `geopose` and `covariance` are as in `Localization`. `tile` is the atlas tile in whose
+    world the pose is.
     """
 
     world_from_cam: Rigid3
@@ -186,6 +194,7 @@ class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "no
     node_id: _NodeId
     geopose: GeoPose | None = None
     tile: str | None = None
+    covariance: Float[np.ndarray, "6 6"] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the alternative as a JSON object."""
@@ -195,6 +204,7 @@ class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "no
             "node": self.node_id,
         }
         pose |= {} if self.tile is None else {"tile": self.tile}
+        pose |= {} if self.covariance is None else {"covariance": self.covariance.tolist()}
         return pose if self.geopose is None else pose | {"geopose": self.geopose.to_json()}
 
 
@@ -202,7 +212,8 @@ class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "no
 class NotLocalized(_Result):
     """Report that no pose is certain enough, with the `reason`.
 
-    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first."""
+    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first, or the pose of
+    an `imprecise` one."""
 
     reason: Reason
     candidates: list[CandidateNode] = field(default_factory=list)

@@ -18,6 +18,7 @@ from built_room import unseen_views
 from peak_memory import PEAK_KB
 from topoloc.apps.cli import main
 from topoloc.apps.cli.queries.localize import Localizer
+from topoloc.localization.result import NotLocalized, result_from_json
 
 
 def test_evaluate_writes_the_documented_json(
@@ -121,6 +122,34 @@ def test_an_out_of_map_image_is_not_localized(
     assert not line["localized"]
     assert line["reason"] in ("too_few_matches", "too_few_inliers", "not_in_map")
     assert printed.err == ""
+
+
+def test_poses_less_precise_than_the_tolerance_are_refused_with_the_pose(
+    room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    answers = dict[str, list[dict[str, Any]]]()
+    for tolerance in ("0.5,5", "0.001,0.001"):
+        out = tmp_path / f"{tolerance}.jsonl"
+        main(
+            ["localize", str(room_map), str(queries), "--tolerance", tolerance, "--json", str(out)]
+        )
+        answers[tolerance] = read_lines(out)
+    assert all(one["localized"] for one in answers["0.5,5"])
+    for given, refused in zip(*answers.values(), strict=True):
+        assert refused["reason"] == "imprecise"
+        assert refused["detail"].startswith("in the map, but where is known to 0.0")
+        (pose,) = refused["alternatives"]
+        assert pose["world_from_cam"] == given["world_from_cam"]
+        assert pose["covariance"] == given["covariance"]
+        read = result_from_json(json.dumps(refused))
+        assert isinstance(read, NotLocalized)
+        assert read.alternatives[0].covariance is not None
+    capsys.readouterr()
+    for wrong in ("x", "1", "0,1", "1,nan"):
+        assert main(["localize", str(room_map), str(queries), "--tolerance", wrong]) == 2
+        printed = capsys.readouterr().err
+        assert printed.startswith("error: --tolerance")
+        assert printed.count("\n") == 1
 
 
 def test_a_query_may_be_given_a_time(

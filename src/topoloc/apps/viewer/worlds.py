@@ -124,19 +124,27 @@ def transform_answers(
             if answer.get(key) is not None
         }
         if "covariance" in moved:
-            covariance = np.array(moved["covariance"], np.float64)
-            moved["covariance"] = pose.transform_covariance(covariance).tolist()
+            moved["covariance"] = _transform_covariance(pose, moved["covariance"])
         if alternatives:
             placed = [
                 (one, world.world_from_map_of(one.get("tile") or tile_id)) for one in alternatives
             ]
             moved["alternatives"] = [
-                one | {"world_from_cam": _transform_pose(there, one["world_from_cam"])}
-                for one, there in placed
-                if there is not None
+                _transform_alternative(there, one) for one, there in placed if there is not None
             ]
         transformed.append(moved)
     return transformed
+
+
+def _transform_alternative(world_from_map: Rigid3, one: Mapping[str, Any]) -> dict[str, Any]:
+    moved = dict(one) | {"world_from_cam": _transform_pose(world_from_map, one["world_from_cam"])}
+    if "covariance" in moved:
+        moved["covariance"] = _transform_covariance(world_from_map, moved["covariance"])
+    return moved
+
+
+def _transform_covariance(world_from_map: Rigid3, covariance: Any) -> Any:
+    return world_from_map.transform_covariance(np.array(covariance, np.float64)).tolist()
 
 
 def _transform_pose(world_from_map: Rigid3, pose: Any) -> dict[str, Any]:

@@ -203,7 +203,10 @@ def _ambiguous_result(
     found = [(best.tile_id, best.answer.poses[0]), *((one.tile_id, one.pose) for one in rivals)]
     probable = select_probable(found, shares)
     alternatives = tuple(
-        Alternative(pose.world_from_cam, probability, pose.node_id, pose.geopose, tile_id)
+        Alternative(
+            *(pose.world_from_cam, probability, pose.node_id, pose.geopose, tile_id),
+            covariance=pose.covariance,
+        )
         for (tile_id, (pose, _)), probability in probable
     )
     detail = f"as much like tile {alternatives[1].tile} as like tile {alternatives[0].tile}"

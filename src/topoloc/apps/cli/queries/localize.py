@@ -113,6 +113,9 @@ class Command:
     features: QUERY_FEATURES = None
     max_ms: Annotated[float | None, option("N", "no limit")] = None
     """Time limit for an image in milliseconds. The first hypothesis is always tested."""
+    tolerance: Annotated[str | None, option("METRES,DEGREES", "that of the weights, 0.25,2")] = None
+    """Maximum error of a pose. Poses with larger standard deviations are refused as `imprecise`,
+    wider tolerances forgive more. The result holds the pose."""
     near: Annotated[
         str | None, tyro.conf.arg(metavar="LAT,LON,METRES", help_behavior_hint="(atlases only)")
     ] = None
@@ -184,8 +187,16 @@ class Command:
     def _open_localizer(self, settings: Settings, near: GeoPositionPrior | None) -> Localizer:
         config = with_option(settings.get(LocalizerConfig), "coarse", self.coarse, "--coarse")
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
+        config = with_option(config, "evidence.tolerance", self._parse_tolerance(), "--tolerance")
         localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         return localizer if near is None else localizer.near(near)
+
+    def _parse_tolerance(self) -> tuple[float, ...] | None:
+        try:
+            words = () if self.tolerance is None else self.tolerance.split(",")
+            return tuple(map(float, words)) or None
+        except ValueError:
+            raise UsageError("--tolerance takes metres and degrees, such as 0.5,5") from None
 
     def _parse_near(self) -> GeoPositionPrior | None:
         with UsageError.at("--near", AtlasError):

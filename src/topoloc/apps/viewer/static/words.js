@@ -3,6 +3,7 @@
 const REASONS = {
   too_few_matches: "Too few features of the image match the map.",
   too_few_inliers: "The matches do not agree on one pose.",
+  imprecise: "The place is known, but not precisely enough.",
   ambiguous: "Several similar places are possible.",
   not_in_map: "The image is probably out of the map.",
   jump: "It contradicts the previous images.",
