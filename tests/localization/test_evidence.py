@@ -124,8 +124,8 @@ def test_an_imprecise_pose_is_distinguished_from_one_without_evidence():
 
 
 def test_indoors_less_is_tolerated():
-    assert compute_translation_tolerance(20.0, 0.25) == 0.25
-    assert compute_translation_tolerance(2.0, 0.25) == pytest.approx(0.1)
+    assert compute_translation_tolerance(20.0, CONFIG) == 0.25
+    assert compute_translation_tolerance(2.0, CONFIG) == pytest.approx(0.1)
 
 
 def test_a_wider_tolerance_forgives_a_lack_of_precision_but_proves_no_place():

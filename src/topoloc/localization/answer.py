@@ -166,9 +166,9 @@ def _weigh_camera(
 
 def probability_within(search: Search, best: Hypothesis, camera: CameraBelief) -> float:
     """Return the probability that a camera moves the pose by less than the tolerances."""
-    max_translation, max_rotation_deg = search.config.evidence.max_errors
-    max_translation = compute_translation_tolerance(best.fit.median_depth, max_translation)
-    return camera.probability_within(max_translation, math.radians(max_rotation_deg))
+    config = search.config.evidence
+    max_translation = compute_translation_tolerance(best.fit.median_depth, config)
+    return camera.probability_within(max_translation, math.radians(config.max_errors[1]))
 
 
 def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:

@@ -36,12 +36,12 @@ _PRECISE_DOUBT = 0.3
 """Doubt below which a pose is precise enough."""
 
 
-def compute_translation_tolerance(median_depth: float, max_translation: float) -> float:
+def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -> float:
     """Return the maximum position error (metres) of a right pose for points `median_depth` (metres)
     away."""
     # Maximum position error as a share of the median distance of the seen points.
-    depth_share = 0.05 * max_translation / EvidenceConfig.max_translation
-    return min(max_translation, depth_share * median_depth)
+    depth_share, max_translation = 0.05, config.max_errors[0]
+    return max_translation * min(1.0, depth_share * median_depth / config.max_translation)
 
 
 def compute_normalized_uncertainty(
@@ -57,10 +57,10 @@ def compute_normalized_uncertainty(
     )
     fitted, asked = (
         math.hypot(
-            metres / compute_translation_tolerance(median_depth, max_translation),
-            math.degrees(radians) / max_rotation_deg,
+            metres / compute_translation_tolerance(median_depth, one),
+            math.degrees(radians) / one.max_errors[1],
         )
-        for max_translation, max_rotation_deg in (EvidenceConfig().max_errors, config.max_errors)
+        for one in (EvidenceConfig(), config)
     )
     return max(asked, min(fitted, _PRECISE_DOUBT))
 
