@@ -18,7 +18,7 @@ export interface Camera {
   [parameter: string]: number | string;
 }
 
-export type Reason = "too_few_matches" | "too_few_inliers" | "ambiguous" | "not_in_map" | "jump" | "unreadable";
+export type Reason = "too_few_matches" | "too_few_inliers" | "imprecise" | "ambiguous" | "not_in_map" | "jump" | "unreadable";
 
 /** What every result has. `t_ns` is exact to 256 ns, as numbers of JavaScript are. */
 export interface Query {

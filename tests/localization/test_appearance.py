@@ -229,12 +229,3 @@ def test_swapped_red_and_blue_are_told(lab: TopoMetricMap):
         assert found.appearance is not None
         assert found.appearance > 0.9
         assert any("red and blue of the image swapped" in one.text for one in trace.findings)
-
-
-def test_white_walls_keep_their_colour_and_clipped_ones_have_none():
-    image = np.full((60, 80, 3), 100, np.uint8)
-    image[:30], image[30:, :40] = 255, (255, 255, 180)
-    colours = small_colours(image)
-    assert colours is not None
-    assert np.allclose(colours[:29, :, 1:], 0.0, atol=1e-6)
-    assert np.isnan(colours[31:, :39]).all()

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from msgspec import Struct
 
 from topoloc.errors import FeatureTypeError
@@ -115,18 +116,31 @@ def compare_colours(search: Search, points: ShownPoints) -> ColourAgreement | No
         return None
     of_query = sample_colours(in_query, points.places)
     of_map = search.templates(points.node_ids).sample_colours(points.points_world)
-    known = np.isfinite(of_query[:, 0] + of_map[:, 0])
+    known = np.isfinite(of_map[:, 0])
     if np.count_nonzero(known) < weights.min_points:
         return None
     compared = of_map[known], points.places[known], weights
-    found = _correlate(of_query[known], *compared)
-    surely = 0.7  # no other colours correlate much better
+    found, surely = _correlate(of_query[known], *compared), 0.7  # no others are much better
     if found is None or found.correlation > surely:
         return found
+    if _is_grey(of_query[known & ~_is_tinted(search.query.image, points.places)], weights):
+        return None
     swapped = _correlate(of_query[known] @ SWAP_RED_AND_BLUE, *compared)
     if swapped is None or swapped.log_odds(weights) < found.log_odds(weights) + weights.swapped:
         return found
     return replace(swapped, is_swapped=True)
+
+
+def _is_tinted(
+    image: UInt8[np.ndarray, "h w 3"], places: Float[np.ndarray, "n 2"]
+) -> Bool[np.ndarray, " n"]:
+    """Return at which places a share of some channels is saturated, which changes the colour. White
+    remains white."""
+    brightest, least_share, size = 250, 0.05, (80, 60)
+    is_bright = cv2.threshold(image, brightest, 255, cv2.THRESH_BINARY)[1]
+    shares = cv2.resize(is_bright, size, interpolation=cv2.INTER_AREA) / 255.0
+    columns, rows = np.clip(places * size, 0, np.array(size) - 1).astype(int).T
+    return np.ptp(shares, axis=2)[rows, columns] > least_share
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +193,7 @@ def _correlate(
     weights: AppearanceWeights,
 ) -> ColourAgreement | None:
     """Correlate `small_colours`. None: the image or the map is grey."""
-    if _is_grey(of_query, weights) or _is_grey(of_map, weights):
+    if _is_grey(of_map, weights):
         return None
     x, y = (2.0 * places - 1.0).T
     slow = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
@@ -197,6 +211,8 @@ def _correlate(
 
 def _is_grey(colours: Float[np.ndarray, "n 3"], weights: AppearanceWeights) -> bool:
     """Return whether the colours follow from the brightness, as those of grey and toned images."""
+    if len(colours) < weights.min_points:
+        return False
     brightness = colours[:, 0] - colours[:, 0].mean()
     tones = brightness[:, None] ** np.arange(4)
     rest = colours[:, 1:] - tones @ np.linalg.lstsq(tones, colours[:, 1:], rcond=None)[0]

@@ -113,18 +113,13 @@ class NodeTemplate:
 
 
 def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
-    """Return the logarithms of brightness, red over green and blue over yellow in 80 columns, NaN
-    where some channels are saturated. None: the image is grey."""
+    """Return the logarithms of brightness, red over green and blue over yellow in 80 columns. None:
+    the image is grey."""
     if image.ndim == 2:
         return None
     size = 80, max(1, round(80 * image.shape[0] / image.shape[1]))
-    darkest, brightest = np.float32(8.0), 250  # levels below are noise, those above saturated
-    levels = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    bright = cv2.threshold(image, brightest, 255, cv2.THRESH_BINARY)[1]
-    # white remains white, but a single saturated channel changes the colour
-    is_tinted = np.ptp(cv2.resize(bright, size, interpolation=cv2.INTER_AREA), axis=2) > 0.05 * 255
-    levels[is_tinted] = np.nan
-    levels = np.log(levels + darkest)
+    darkest = 8.0  # levels below are noise
+    levels = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA) + np.float32(darkest))
     red, green, blue = np.moveaxis(levels, 2, 0)
     yellow = (red + green) / 2.0
     return np.dstack([levels.mean(axis=2), red - green, blue - yellow]).astype(np.float32)

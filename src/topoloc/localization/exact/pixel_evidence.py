@@ -107,8 +107,8 @@ class PixelAgreement:
     def explain(self, log_odds: float, gain: float) -> str:
         """Return the text of the finding about a pose with these log-odds."""
         return (
-            f"pixels of {self.found:.0%} of the points in view agree, {self.by_chance:.0%} by"
-            f" chance, seen {math.degrees(self.angle):.0f} degrees aside: log odds"
+            f"of the points in view {self.found:.0%} look as in the map, {self.by_chance:.0%} by"
+            f" chance, from {math.degrees(self.angle):.0f} degrees aside: log odds"
             f" {log_odds:.1f} -> {log_odds + gain:.1f}"
         )
 
