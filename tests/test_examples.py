@@ -88,6 +88,20 @@ def test_map_and_localize(mapped: tuple[Path, str]):
     assert max(errors) < 2.0
 
 
+def test_as_on_linux_on_arm_without_poselib(lab: Path):
+    no_poselib = (
+        "import sys; sys.modules['poselib'] = None; from topoloc.apps.cli import main; main()"
+    )
+    command = "evaluate", lab, f"{SHIPPED / 'day'}@0::4", f"{SHIPPED / 'night'}@0::4", "--json", "-"
+    printed = subprocess.run(
+        [sys.executable, "-c", no_poselib, *command], check=True, capture_output=True, text=True
+    ).stdout
+    found = json.loads(printed)
+    assert found["num_localized"] == found["num_queries"] == 16
+    assert found["num_inaccurate"] == 0
+    assert found["median_translation_m"] < 0.01
+
+
 def test_localize_folder(run: Run, lab: Path, tmp_path: Path):
     photos = tmp_path / "photos"
     photos.mkdir()

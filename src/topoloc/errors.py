@@ -28,6 +28,7 @@ TopolocError
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -145,6 +146,9 @@ class ClusterError(TopolocError):
     """Report a cluster that does not answer, is not a cluster, or has another version."""
 
 
+_NOT_ON_ARM = ("carla", "colmap", "ros")  # the conditions in pyproject.toml
+
+
 class MissingExtraError(TopolocError):
     """Report a missing optional dependency. The text names the extra that installs it."""
 
@@ -159,4 +163,7 @@ class MissingExtraError(TopolocError):
             if (error.name or "").startswith("topoloc"):
                 raise
             need = text.replace("{}", error.name or str(error))
-            raise cls(f"{need}: pip install 'topoloc[{extra}]'") from error
+            remedy = f"pip install 'topoloc[{extra}]'"
+            if extra in _NOT_ON_ARM and platform.machine() == "aarch64":
+                remedy = "its library has no package for Linux on ARM; use a machine with x86-64"
+            raise cls(f"{need}: {remedy}") from error

@@ -16,6 +16,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import depth_sigmas, ray_covariances
 from topoloc.geometry.rigid import Rigid3, inverse_covariance, position_covariance
 
+pytestmark = pytest.mark.usefixtures("solvers")
+
 PINHOLE = CAMERAS["PINHOLE"]
 METHODS = ("poselib", "opencv")
 

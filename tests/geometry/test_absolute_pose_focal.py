@@ -17,6 +17,8 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
 )
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
+pytestmark = pytest.mark.usefixtures("solvers")
+
 CAM_FROM_WORLD = Rigid3(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 1.0]))
 UNKNOWN = UncalibratedCamera.unknown(640, 480)
 CONFIG = AbsolutePoseConfig(max_reprojection_error_px=8.0)

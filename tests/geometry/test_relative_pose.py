@@ -10,6 +10,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
+pytestmark = pytest.mark.usefixtures("solvers")
+
 FIRST = Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5)
 SECOND = Camera("OPENCV", 640, 480, (420.0, 421.0, 318.0, 241.0, -0.05, 0.01, 0.0, 0.0))
 

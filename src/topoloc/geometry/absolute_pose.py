@@ -1,9 +1,8 @@
 """Estimate a camera pose and its covariance from 2-D/3-D matches: robust PnP.
 
-`method="poselib"` runs PoseLib's LO-RANSAC with P3P (Persson and Nordberg, 2018;
-https://github.com/PoseLib/PoseLib). It uses PROSAC ordering (Chum and Matas, 2005) if priorities
-are given. A robust refinement then weighs each match by the uncertainty of its pixel and of its
-point. `method="opencv"` is the paper's method, section III-B: OpenCV's RANSAC with EPnP and
+`method="poselib"` draws samples (`pose_sampling`), sorted if priorities are given. A robust
+refinement then weighs each match by the uncertainty of its pixel and of its point.
+`method="opencv"` is the paper's method, section III-B: OpenCV's RANSAC with EPnP and
 Levenberg-Marquardt refinement on the inliers.
 
 The covariance assumes independent errors. If a chair was moved or the depth of a wall is wrong, the
@@ -20,7 +19,6 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-import poselib
 from jaxtyping import Bool, Float, Int
 
 from topoloc.bounds import Above, Between
@@ -33,6 +31,7 @@ from topoloc.geometry.pose_matches import (
     cells_of,
     score_gradients,
 )
+from topoloc.geometry.pose_sampling import Sampling, sample_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 
 MAX_THRESHOLD_SCALE = 3.0
@@ -47,8 +46,9 @@ class AbsolutePoseConfig:
     """Hold the settings of pose estimation from 2-D/3-D matches."""
 
     method: Literal["poselib", "opencv"] = "poselib"
-    """PoseLib's RANSAC, or OpenCV's, which stops at 1000 iterations or a confidence of 0.99 and has
-    no seed. For an uncalibrated camera PoseLib is always used."""
+    """PoseLib's RANSAC, or OpenCV's old one, which stops at 1000 iterations or a confidence of 0.99
+    and has no seed. For an uncalibrated camera PoseLib is always used. Where PoseLib has no package
+    (Linux on ARM), OpenCV's USAC stands in for it."""
     max_reprojection_error_px: Annotated[float, Above(0)] = 4.0
     """Inlier threshold. With poselib the projected uncertainty of a point widens it up to
     threefold, in proportion to the standard deviation that it adds to `sigma_px`."""
@@ -72,6 +72,11 @@ class AbsolutePoseConfig:
         """Return the inlier threshold in pixels, and how many times uncertain points widen it."""
         max_scale = 1.0 if self.method == "opencv" else MAX_THRESHOLD_SCALE
         return self.max_reprojection_error_px, max_scale
+
+    def sampling(self, is_sorted: bool = False) -> Sampling:
+        """Return how samples are drawn."""
+        least, most = self.min_iterations, self.max_iterations
+        return Sampling(self.max_reprojection_error_px, least, most, self.seed, is_sorted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +149,8 @@ def estimate_absolute_pose(
         if config.method == "opencv":
             start, num_rounds = _solve_with_opencv(*solved), 0
         else:
-            start, *_ = estimate_pose_ransac(*solved, priorities is not None) or (None,)
+            sampling = config.sampling(priorities is not None)
+            start, *_ = sample_absolute_pose(undistorted, *solved[1:3], sampling) or (None,)
     found = start and matches.fit(start, camera, *config.inlier_limits, num_rounds)
     return found and _pose_of_all(found, order, len(points_img))
 
@@ -188,50 +194,6 @@ def _pose_of_all(
     inliers = np.zeros(num_points, dtype=np.bool_)
     inliers[rows] = active
     return AbsolutePose(cam_from_world, inliers, covariance)
-
-
-def estimate_pose_ransac(
-    undistorted: Float[np.ndarray, "n 2"],
-    points_world: Float[np.ndarray, "n 3"],
-    camera: Camera,
-    config: AbsolutePoseConfig,
-    is_sorted: bool = False,
-) -> tuple[Rigid3, int, float] | None:
-    """Run only PoseLib's RANSAC on n finite matches of undistorted pixels.
-
-    Return cam_from_world, the number of inliers, and the sum of squared errors (px^2), each limited
-    to the squared threshold. Return None if the samples give no pose. Points count as exact.
-
-    Args:
-        is_sorted: the matches are sorted, most likely right first.
-    """
-    params = camera.intrinsics
-    pinhole = {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "params": list(params),
-    }
-    ransac = {
-        "max_reproj_error": config.max_reprojection_error_px,
-        "max_iterations": config.max_iterations,
-        "min_iterations": config.min_iterations,
-        "success_prob": 0.999,  # that no better pose is left
-        # PoseLib's default of 3 triples the time without more poses, thanks to local optimisation
-        "dyn_num_trials_mult": 1.0,
-        "progressive_sampling": is_sorted,
-        "seed": config.seed,
-    }
-    no_bundle = {"max_iterations": 0}  # the refinement on the inliers replaces it
-    pose, ransac_info = poselib.estimate_absolute_pose(
-        undistorted, points_world, pinhole, ransac, no_bundle
-    )
-    matrix = np.asarray(pose.Rt, dtype=np.float64)
-    if not np.isfinite(matrix).all():
-        return None
-    # PoseLib's score is on the plane z = 1.
-    loss = float(ransac_info["model_score"]) * ((params[0] + params[1]) / 2) ** 2
-    return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), int(ransac_info["num_inliers"]), loss
 
 
 def _solve_with_opencv(

@@ -20,7 +20,6 @@ from topoloc.geometry.absolute_pose import (
     AbsolutePose,
     AbsolutePoseConfig,
     estimate_absolute_pose,
-    estimate_pose_ransac,
     select_inliers,
 )
 from topoloc.geometry.camera import Camera, UncalibratedCamera
@@ -46,6 +45,7 @@ from topoloc.geometry.pose_matches import (
     solve_cholesky,
     squared_errors,
 )
+from topoloc.geometry.pose_sampling import sample_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 
 _FiniteMatches = tuple[
@@ -215,8 +215,8 @@ def _search_focal_lengths(
         enough = max(1, math.ceil(math.log(1.0 - 0.999) / math.log1p(-(share**3))))
         iterations = min(config.max_iterations, _MAX_ITERATIONS, enough)
         quick = replace(config, max_iterations=iterations, seed=config.seed + k)
-        cam_from_world, num_inliers, loss = estimate_pose_ransac(
-            points_img, points_world, camera, quick
+        cam_from_world, num_inliers, loss = sample_absolute_pose(
+            points_img, points_world, camera, quick.sampling()
         ) or (None, 0, math.inf)
         if cam_from_world is not None and num_inliers >= _MIN_INLIERS:
             found.append((loss, cam_from_world, camera))

@@ -1,8 +1,5 @@
 """Estimate the motion of a camera between two images from matched pixels: the rotation and the
-direction of the translation, without its length.
-
-The method is PoseLib's five-point method in LO-RANSAC (https://github.com/PoseLib/PoseLib).
-"""
+direction of the translation, without its length."""
 
 from __future__ import annotations
 
@@ -10,10 +7,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import poselib
 from jaxtyping import Bool, Float
 
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_sampling import sample_relative_pose
 from topoloc.geometry.rigid import Rigid3
 
 _MAX_EPIPOLAR_ERROR_PX = 1.5
@@ -48,21 +45,19 @@ def estimate_relative_pose(
     if len(kept) < 8:
         return None
     focal = 0.5 * (first.fx + second.fx)
-    size = {"width": first.width, "height": first.height}
-    pinhole = {"model": "SIMPLE_PINHOLE", **size, "params": [focal, 0.0, 0.0]}
-    ransac = {"max_epipolar_error": _MAX_EPIPOLAR_ERROR_PX, "seed": 0}
-    pose, ransac_info = poselib.estimate_relative_pose(
-        focal * rays[0][kept], focal * rays[1][kept], pinhole, pinhole, ransac, {}
-    )
-    matrix, inliers = np.asarray(pose.Rt, dtype=np.float64), np.zeros(len(first_img), bool)
-    inliers[kept] = ransac_info["inliers"]
-    distance = float(np.linalg.norm(matrix[:, 3]))
-    if not np.isfinite(matrix).all() or distance == 0.0 or not inliers.any():
+    on_planes = rays[0][kept], rays[1][kept]
+    if (found := sample_relative_pose(*on_planes, focal, _MAX_EPIPOLAR_ERROR_PX)) is None:
+        return None
+    second_from_first, inliers = found[0], np.zeros(len(first_img), bool)
+    inliers[kept] = found[1]
+    rotation, translation = second_from_first.rotation, second_from_first.translation
+    distance = float(np.linalg.norm(translation))
+    if distance == 0.0:
         return None
     firsts, seconds = (np.insert(rays_of[inliers], 2, 1.0, axis=1) for rays_of in rays)
-    rotated = firsts @ matrix[:, :3].T
+    rotated = firsts @ rotation.T
     lengths = np.linalg.norm(rotated, axis=1) * np.linalg.norm(seconds, axis=1)
     cosines = np.sum(rotated * seconds, axis=1) / lengths
     if np.median(np.arccos(np.clip(cosines, -1.0, 1.0))) < _MIN_PARALLAX:
         return None
-    return RelativePose(Rigid3(matrix[:, :3].copy(), matrix[:, 3] / distance), inliers)
+    return RelativePose(Rigid3(rotation, translation / distance), inliers)

@@ -14,6 +14,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from packaging.requirements import Requirement
+
 import topoloc
 from topoloc import plugin
 from topoloc.apps import core_names
@@ -27,7 +29,6 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 
-_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)[^;>]*(>=(?P<least>[\d.]+))?[^;]*(;(?P<marker>.*))?")
 _REINSTALL = "reinstall: pip install --force-reinstall topoloc"
 Found = tuple[dict[str, Any], list[str]]
 """The facts of one part of the report, and its faults, each with a remedy."""
@@ -64,12 +65,12 @@ def _examine_versions() -> Found:
     facts = {"topoloc": _version_of("topoloc"), "python": platform.python_version()}
     facts["platform"] = platform.platform()
     facts |= {name: found for name in PLUGIN_PACKAGES.values() if (found := _version_of(name))}
-    needed = {name: least for extra, name, least, _ in _requirements() if not extra}
-    libraries = {name: _version_of(name) for name in needed}
+    needed = [one for extra, one in _requirements() if not extra]
+    libraries = {one.name: _version_of(one.name) for one in needed}
     faults = [
-        f"{name} {found or 'is missing'}; pip install '{name}>={needed[name]}'"
-        for name, found in libraries.items()
-        if _is_older(found, needed[name])
+        f"{one.name} {libraries[one.name] or 'is missing'}; pip install '{one.name}{one.specifier}'"
+        for one in needed
+        if not _is_installed(one)
     ]
     if not needed:
         faults.append("topoloc is not installed: pip install topoloc")
@@ -90,13 +91,14 @@ def _examine_processor() -> Found:
 
 
 def _examine_extras() -> Found:
-    """Return the extras, and the missing libraries of each."""
-    facts: dict[str, Any] = {}
-    for extra, name, least, condition in _requirements():
-        if extra and extra not in ("all", "docs", "test"):
-            one = facts.setdefault(extra, {"missing": [], "only_if": condition, "install": None})
-            if _is_older(_version_of(name), least):
-                one["missing"].append(name)
+    """Return the extras, and the missing libraries of each. None: this platform has none."""
+    extras = metadata.metadata("topoloc").get_all("Provides-Extra", [])
+    facts = dict[str, Any].fromkeys(one for one in extras if one not in ("all", "docs", "test"))
+    for extra, library in _requirements():
+        if extra in facts:
+            one = facts[extra] = facts[extra] or {"missing": [], "install": None}
+            if not _is_installed(library):
+                one["missing"].append(library.name)
                 one["install"] = f"pip install 'topoloc[{extra}]'"
     return facts, []
 
@@ -191,9 +193,10 @@ def _describe(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if one := facts["processor"]:
         yield "processor", f"{one['model']}: {one['processors']} cores, {one['usable']} usable"
     for name, one in facts["extras"].items():
-        only = f" (only {one['only_if']})" if one["only_if"] else ""
-        lack = f"{', '.join(one['missing'])} missing: {one['install']}{only}"
-        yield f"extra {name}", lack if one["missing"] else "installed"
+        text = "installed" if one else "has no package for this platform"
+        if one and one["missing"]:
+            text = f"{', '.join(one['missing'])} missing: {one['install']}"
+        yield f"extra {name}", text
     for name, folders in facts["caches"].items():
         for one in folders:
             access = "writable" if one["writable"] else "read-only"
@@ -211,17 +214,20 @@ def _describe(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "self-test", f"{text}; {one['seconds']:.1f} s"
 
 
-def _requirements() -> Iterator[tuple[str, str, str, str]]:
-    """Yield extra, name, least version and condition of each library that topoloc may use."""
+def _requirements() -> Iterator[tuple[str, Requirement]]:
+    """Yield the extra, empty for the program itself, and each library that topoloc may use on this
+    platform."""
     try:
         lines = metadata.requires("topoloc") or []
     except metadata.PackageNotFoundError:
         return
-    for line in lines:
-        if match := _REQUIREMENT.fullmatch(line):
-            condition, _, extra = (match["marker"] or "").rpartition("extra == ")
-            condition = condition.strip().removesuffix(" and").strip("()")
-            yield extra.strip("'\" "), match["name"], match["least"] or "0", condition
+    extras = metadata.metadata("topoloc").get_all("Provides-Extra", [])
+    for one in map(Requirement, lines):
+        for extra in ("", *extras):
+            if one.marker is None or one.marker.evaluate({"extra": extra}):
+                yield extra, one
+                if not extra:
+                    break
 
 
 def _version_of(name: str) -> str | None:
@@ -231,10 +237,9 @@ def _version_of(name: str) -> str | None:
         return None
 
 
-def _is_older(found: str | None, least: str) -> bool:
-    """Return whether a library is missing or older than needed."""
-    numbers = [[int(n) for n in re.findall(r"\d+", one)[:3]] for one in (found or "", least)]
-    return numbers[0] < numbers[1]
+def _is_installed(library: Requirement) -> bool:
+    found = _version_of(library.name)
+    return found is not None and library.specifier.contains(found, prereleases=True)
 
 
 def _describe_folder(folder: Path, pattern: str) -> dict[str, Any]:

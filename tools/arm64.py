@@ -1,0 +1,145 @@
+"""Run topoloc as on Linux on ARM (aarch64), emulated: python tools/arm64.py ROOT [--demo FOLDER]
+    [--tests PATH ...]
+
+Makes ROOT from Debian's arm64 packages and aarch64 wheels, once. Then runs `topoloc doctor`, the
+queries of a folder of `topoloc demo`, and tests, by QEMU. The same queries run on this machine
+without PoseLib, which has no package there: poses may differ by a millimetre. Emulated times say
+nothing. Needs `apt-get` with Debian's lists (without root), and QEMU 10: version 7.2 of Debian 12
+ends in ONNX Runtime, its backports have a newer `qemu-user`; --emulator gives another path.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+from packaging.requirements import Requirement
+
+HERE = Path(__file__).resolve().parents[1]
+ARM = {"platform_machine": "aarch64", "sys_platform": "linux", "platform_system": "Linux"}
+PYTHON = "3.11"  # Debian 12's
+WITHOUT_POSELIB = (
+    "import sys; sys.modules['poselib'] = None;from topoloc.apps.cli import main; sys.exit(main())"
+)
+MAX_DIFFERENCE = 1e-3  # metres
+WALKS = ("day", "night", "other_camera")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("root", type=Path)
+    parser.add_argument("--demo", type=Path)
+    parser.add_argument("--emulator", default="qemu-aarch64")
+    parser.add_argument("--tests", nargs="*", default=[])
+    arguments = parser.parse_args()
+    root = arguments.root.resolve()
+    if not (root / "made").exists():
+        add_debian(root)
+        add_wheels(root)
+        (root / "made").touch()
+    emulated = emulate(root, arguments.emulator)
+    failed = subprocess.run([*emulated, "-m", "topoloc", "doctor"]).returncode
+    if arguments.demo is not None:
+        failed |= compare_queries(emulated, arguments.demo, root)
+    if arguments.tests:
+        tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments.tests]
+        failed |= subprocess.run([*emulated, *tests]).returncode
+    return failed
+
+
+def emulate(root: Path, emulator: str) -> list[str]:
+    """Return the words of a command that start ROOT's Python, and set its variables."""
+    folders = root / "site", HERE / "src", HERE / "worlds" / "src"
+    os.environ |= {
+        "PYTHONPATH": os.pathsep.join(map(str, folders)),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "NUMBA_CACHE_DIR": str(root / "kernels"),
+        "XDG_CACHE_HOME": str(root / "cache"),
+    }
+    return [emulator, "-L", str(root), str(root / "usr" / "bin" / f"python{PYTHON}")]
+
+
+def add_debian(root: Path) -> None:
+    """Unpack Debian's Python and the libraries of wheels."""
+    lists, packages = root / "lists", root / "packages"
+    for folder in (lists / "partial", packages / "partial", root / "dpkg"):
+        folder.mkdir(parents=True, exist_ok=True)
+    (root / "dpkg" / "status").touch()
+    options = {
+        "APT::Architecture": "arm64",
+        "APT::Architectures": "arm64",
+        "Dir::State::Lists": lists,
+        "Dir::State::status": root / "dpkg" / "status",
+        "Dir::Cache::Archives": packages,
+        "Dir::Cache::pkgcache": "",
+        "Dir::Cache::srcpkgcache": "",
+        "Debug::NoLocking": "true",
+    }
+    apt = [
+        "apt-get",
+        "--yes",
+        *(word for one in options.items() for word in ("-o", "=".join(map(str, one)))),
+    ]
+    subprocess.run([*apt, "update"], check=True)
+    wanted = [f"python{PYTHON}", "libstdc++6", "libgomp1"]
+    subprocess.run(
+        [*apt, "--no-install-recommends", "--download-only", "install", *wanted], check=True
+    )
+    for package in sorted(packages.glob("*.deb")):
+        subprocess.run(["dpkg-deb", "-x", package, root], check=True)
+
+
+def add_wheels(root: Path) -> None:
+    """Install what topoloc and its tests need for aarch64, at the versions of constraints.txt."""
+    project = tomllib.loads((HERE / "pyproject.toml").read_text())["project"]
+    tools = {"beartype", "hypothesis", "jsonschema", "onnx", "pytest", "scipy"}
+    listed = map(Requirement, project["dependencies"] + project["optional-dependencies"]["test"])
+    wanted = [
+        one
+        for one in listed
+        if (one.marker is None or one.marker.evaluate(ARM))
+        and (str(one) in project["dependencies"] or one.name in tools)
+    ]
+    platforms = [f"manylinux_2_{k}_aarch64" for k in (17, 26, 27, 28, 31, 34)] + [
+        "manylinux2014_aarch64"
+    ]
+    options = [word for one in platforms for word in ("--platform", one)]
+    options += [word for one in ("cp311", "abi3", "none") for word in ("--abi", one)]
+    options += ["--python-version", PYTHON, "--implementation", "cp", "--only-binary", ":all:"]
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "pip", "install", "--quiet", "--target", root / "site"),
+            *("--constraint", HERE / "constraints.txt", *options),
+            *(f"{one.name}{one.specifier}" for one in wanted),
+        ],
+        check=True,
+    )
+
+
+def compare_queries(emulated: list[str], demo: Path, root: Path) -> int:
+    """Localize the walks of the demo here and emulated. Return 1 if answers differ."""
+    from topoloc.demo.recordings import SHIPPED
+
+    here, failed = [sys.executable, "-c", WITHOUT_POSELIB], 0
+    for walk in WALKS:
+        answers = list[dict[float, np.ndarray]]()
+        for name, python in (("here", here), ("arm", [*emulated, "-m", "topoloc"])):
+            out = root / f"{walk}-{name}.tum"
+            words = ["localize", demo / "lab.topo", SHIPPED / walk, "--single", "--tum", out]
+            out.unlink(missing_ok=True)
+            subprocess.run([*python, *words], check=True, stdout=subprocess.DEVNULL)
+            poses = np.loadtxt(out, ndmin=2)
+            answers.append(dict(zip(poses[:, 0], poses[:, 1:4], strict=True)))
+        both = answers[0].keys() & answers[1].keys()
+        others = len(answers[0].keys() ^ answers[1].keys())
+        largest = max((np.linalg.norm(answers[0][t] - answers[1][t]) for t in both), default=0.0)
+        print(f"{walk}: {len(both)} of both, {others} of one only, up to {1000 * largest:.2f} mm")
+        failed |= others > 0 or largest > MAX_DIFFERENCE
+    return int(failed)
