@@ -37,12 +37,8 @@ import cv2
 import numpy as np
 
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.proposals.propose import propose_first
-from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Search, Trace
-from topoloc.localization.walls.propose_virtual_views import Comparison
-from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 
@@ -75,9 +71,12 @@ def timed(name: str, propose: Callable[..., Any]) -> Callable[..., Iterator[Any]
 
 def work(fast: bool, light: float) -> None:
     """Answer the questions of standard input, one line each: the map, a recording, an index."""
-    known = [one for one in (*SOURCES, "virtual_views") if hasattr(schedule, f"propose_{one}")]
-    for name in known:
-        setattr(schedule, f"propose_{name}", timed(name, getattr(schedule, f"propose_{name}")))
+    # older trees import the sources elsewhere
+    modules = [one for name, one in sys.modules.items() if name.startswith("topoloc.localization")]
+    for name in (*SOURCES, "virtual_views"):
+        for module in modules:
+            if source := getattr(module, f"propose_{name}", None):
+                setattr(module, f"propose_{name}", timed(name, source))
     localizers, sequences = dict[str, Localizer](), dict[str, Any]()
     config = LocalizerConfig(exactness="fast" if fast else "best")
     for line in sys.stdin:
@@ -234,6 +233,10 @@ def _is(answer: Answer) -> bool:
 
 def fit(path: str, recordings: list[str], light: float) -> None:
     """Print the figures of right poses at each step."""
+    # older trees, which --beside runs, have these elsewhere
+    from topoloc.localization.proposals.propose import propose_first
+    from topoloc.localization.query import Deadline, QueryImage, StageClock
+
     localizer, inliers = Localizer(path), defaultdict[str, list[int]](list)
     right, wrong = defaultdict[str, list[int]](list), defaultdict[str, list[int]](list)
     for recording in recordings:
@@ -260,6 +263,9 @@ def fit(path: str, recordings: list[str], light: float) -> None:
 def agreements(search: Search, frame: StereoFrame) -> Iterator[tuple[str, bool, int]]:
     """Generate the agreement at the best place of each step, and whether the image's right place is
     among those of the whole views."""
+    from topoloc.localization.walls.propose_virtual_views import Comparison
+    from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
+
     index, stop = search.map.walls, search.weights.walls.stop
     assert index is not None
     whole = VirtualViewSearch.around(search, index)

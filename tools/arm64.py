@@ -56,7 +56,8 @@ def main() -> int:
 
 def emulate(root: Path, emulator: str) -> list[str]:
     """Return the words of a command that start ROOT's Python, and set its variables."""
-    folders = root / "site", HERE / "src", HERE / "worlds" / "src"
+    # the sources come first; of the installed project only its metadata are read
+    folders = HERE / "src", HERE / "worlds" / "src", root / "site"
     os.environ |= {
         "PYTHONPATH": os.pathsep.join(map(str, folders)),
         "PYTHONDONTWRITEBYTECODE": "1",
@@ -113,14 +114,11 @@ def add_wheels(root: Path) -> None:
     options = [word for one in platforms for word in ("--platform", one)]
     options += [word for one in ("cp311", "abi3", "none") for word in ("--abi", one)]
     options += ["--python-version", PYTHON, "--implementation", "cp", "--only-binary", ":all:"]
-    subprocess.run(
-        [
-            *(sys.executable, "-m", "pip", "install", "--quiet", "--target", root / "site"),
-            *("--constraint", HERE / "constraints.txt", *options),
-            *(f"{one.name}{one.specifier}" for one in wanted),
-        ],
-        check=True,
-    )
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--target", root / "site"]
+    libraries = [f"{one.name}{one.specifier}" for one in wanted]
+    constraints = ["--constraint", HERE / "constraints.txt"]
+    subprocess.run([*install, *constraints, *options, *libraries], check=True)
+    subprocess.run([*install, "--no-deps", HERE], check=True)
 
 
 def compare_queries(emulated: list[str], demo: Path, root: Path) -> int:
@@ -143,3 +141,7 @@ def compare_queries(emulated: list[str], demo: Path, root: Path) -> int:
         print(f"{walk}: {len(both)} of both, {others} of one only, up to {1000 * largest:.2f} mm")
         failed |= others > 0 or largest > MAX_DIFFERENCE
     return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -34,6 +35,26 @@ from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
+
+
+@dataclass(frozen=True, eq=False)
+class _ReadNode:
+    """Hold a node that was read once: its points, and the node without them, for its image."""
+
+    local_map: LocalMap
+    pictured: TopoNode
+
+    @staticmethod
+    def of_node(node: TopoNode) -> _ReadNode:
+        no_points = replace(
+            node,
+            features=Features.empty(node.features.descriptors.shape[1]),
+            points_cam=node.points_cam[:0],
+            point_sqrt_covs=node.point_sqrt_covs[:0],
+            session_statistics=(),
+            stored_descriptors=None,
+        )
+        return _ReadNode(LocalMap.of_node(node), no_points)
 
 
 class FeatureMap:
@@ -71,9 +92,9 @@ class FeatureMap:
         self.node_ids = [summary.node_id for summary in topomap.summaries]
         self.node_poses = topomap.node_poses
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
-        self._local_map = CachedNodes(lambda row: LocalMap.of_node(self._nodes[row]))
+        self._read = CachedNodes(lambda row: _ReadNode.of_node(self._nodes[row]))
         self._moves = CachedNodes(self._find_moves)
-        self._template = CachedNodes(lambda row: NodeTemplate.of_node(self._nodes[row]))
+        self._template = CachedNodes(lambda row: NodeTemplate.of_node(self._read(row).pictured))
         known = topomap.repetitions
         is_current = known is not None and known.digest == digest_of(topomap.summaries)
         self._stored_moves = dict(known.moves) if known is not None and is_current else None
@@ -112,7 +133,7 @@ class FeatureMap:
 
     def local_maps(self, rows: Sequence[Row]) -> list[LocalMap]:
         """Return the points of each of these nodes."""
-        return self._local_map.pool(rows)
+        return [one.local_map for one in self._read.pool(rows)]
 
     def templates(self, node_ids: Iterable[NodeId]) -> list[NodeTemplate]:
         """Return the images of these nodes."""
@@ -129,7 +150,7 @@ class FeatureMap:
         if kept is None or kept[0] != camera:  # most queries share one camera
             read = CachedNodes(
                 lambda row: predict_key_points(
-                    self._local_map(row), self.cam_from_world(row), camera
+                    self._read(row).local_map, self.cam_from_world(row), camera
                 )
             )
             self._predicted_at_nodes = kept = (camera, read)
@@ -190,7 +211,7 @@ class FeatureMap:
         return open_map_coarse_localizer(self.topomap, SurfVlad.name, kind)
 
     def _find_shifts(self, row: Row) -> Float[np.ndarray, "k 3"]:
-        node, poses = self._local_map(row), self.node_poses
+        node, poses = self._read(row).local_map, self.node_poses
         # in most repetitive places a node's own image shows some part twice
         if len(find_repetition_shifts(node, node, min_share=0.15)) == 0:
             return np.zeros((0, 3))

@@ -112,6 +112,12 @@ class NodeTemplate:
         return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None, colours)
 
 
+_BRIGHTNESS_AND_COLOURS: Float[np.ndarray, "3 3"] = np.array(
+    [[1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0], [1.0, -1.0, 0.0], [-0.5, -0.5, 1.0]]
+)
+"""The mean of red, green and blue, red less green, and blue less yellow."""
+
+
 def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
     """Return the logarithms of brightness, red over green and blue over yellow in 80 columns. None:
     the image is grey."""
@@ -120,9 +126,7 @@ def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
     size = 80, max(1, round(80 * image.shape[0] / image.shape[1]))
     darkest = 8.0  # levels below are noise
     levels = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA) + np.float32(darkest))
-    red, green, blue = np.moveaxis(levels, 2, 0)
-    yellow = (red + green) / 2.0
-    return np.dstack([levels.mean(axis=2), red - green, blue - yellow]).astype(np.float32)
+    return cv2.transform(levels, _BRIGHTNESS_AND_COLOURS)
 
 
 def sample_colours(
