@@ -8,6 +8,7 @@ cannot be detected. Features use grey values, which change little with the swap.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -130,13 +131,15 @@ class SequenceView(IndexedFrames):
     """Show selected frames of another sequence in the given order with the given poses.
 
     `apart` holds the poses of stretches whose transforms to each other are unknown. Each stretch
-    has its own world and one pose per frame, None outside of the stretch.
+    has its own world and one pose per frame, None outside of the stretch. Depth from `max_depth`
+    (metres) on is unknown.
     """
 
     base: StereoSequence
     indices: list[int]
     poses: list[Rigid3 | None]
     apart: tuple[list[Rigid3 | None], ...] = ()
+    max_depth: float = math.inf
 
     @property
     def name(self) -> str:
@@ -167,15 +170,23 @@ class SequenceView(IndexedFrames):
 
     def read_frame(self, row: int) -> StereoFrame:
         """Read one frame. Raises as the base sequence."""
-        return replace(self.base[self.indices[row]], world_from_cam=self.poses[row])
+        frame = replace(self.base[self.indices[row]], world_from_cam=self.poses[row])
+        if frame.depth is None or self.max_depth == math.inf:
+            return frame
+        depth = frame.depth.depth
+        known = np.where(depth < np.float32(self.max_depth), depth, np.float32(np.nan))
+        return replace(frame, depth=replace(frame.depth, depth=known))
 
 
-def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoSequence:
-    """Return the given frames of a sequence, in this order, with their poses. Images are still read
-    one by one. Raises IndexError: an index is outside of the sequence."""
+def sequence_subset(
+    sequence: StereoSequence, indices: Sequence[int], max_depth: float = math.inf
+) -> StereoSequence:
+    """Return the given frames of a sequence, in this order, with their poses. Depth from
+    `max_depth` (metres) on is unknown. Images are still read one by one. Raises IndexError: an
+    index is outside of the sequence."""
     poses, *apart = (sequence.poses, *getattr(sequence, "apart", ()))
     chosen = [[stretch[index] for index in indices] for stretch in (poses, *apart)]
-    return SequenceView(sequence, list(indices), chosen[0], tuple(chosen[1:]))
+    return SequenceView(sequence, list(indices), chosen[0], tuple(chosen[1:]), max_depth)
 
 
 MIN_MEDIAN_DEPTH, MAX_MEDIAN_DEPTH = 0.05, 100.0

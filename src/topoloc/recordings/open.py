@@ -11,6 +11,7 @@ from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.recordings.calibration import parse_calibration, with_calibration
+from topoloc.recordings.depth_range import leave_out_stuck_depth
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence, sequence_subset
@@ -71,8 +72,8 @@ def open_sequence(
         topics: the topics of a bag: ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a
             dictionary of these.
         warn: called with each note on the recording, such as truncated or guessed data.
-        whole_only: leave out the frames with a missing, empty or truncated image file. A note
-            counts them.
+        whole_only: leave out the frames with a missing, empty or truncated image file, and depth
+            that sticks at the end of the sensor's range. Notes say so.
 
     Raises:
         UnknownFormatError: `format` is unknown, or no format recognises the folder.
@@ -92,7 +93,9 @@ def open_sequence(
         if not indices:
             raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
         sequence = sequence_subset(sequence, indices)
-    return leave_out_damaged(sequence, warn) if whole_only else sequence
+    if not whole_only:
+        return sequence
+    return leave_out_stuck_depth(leave_out_damaged(sequence, warn), warn)
 
 
 def _open_recording(

@@ -1,7 +1,9 @@
 """Check that the depth images of a recording have the view of its images: jumps in depth lie where
-brightness changes. Depth of another camera, or of another focal length, does not."""
+brightness changes. Depth of another camera, focal length or moment does not."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -40,6 +42,42 @@ def find_depth_shift(sequence: StereoSequence) -> str | None:
         f" better with depth scaled by {_ZOOMS[zoom]:.2f} and moved by {x:.0f}, {y:.0f} px of the"
         " image (right, down); record depth that is registered to the colour camera"
     )
+
+
+def find_late_depth(sequence: StereoSequence) -> str | None:
+    """Return a note if depth fits the image before, or after, clearly better than its own. None for
+    other recordings and for images that do not decide. Raises as the recording."""
+    # right depth: another image is better in 0 to 50 % of the frames, and never on average; depth
+    # that is a frame late: in all, twice as good
+    num_frames, min_frames, min_score, min_ratio, min_share = 12, 5, 0.5, 1.15, 0.8
+    if len(sequence) < min_frames or sequence[0].depth is None or sequence[0].camera is None:
+        return None
+    rows = np.unique(np.linspace(1, len(sequence) - 2, num_frames).astype(int)).tolist()
+    scores = list(parallel_map(lambda row: _score_neighbours(sequence, row), rows))
+    known = np.array([one for one in scores if one is not None])
+    if len(known) < min_frames:
+        return None
+    before, own, after = known.mean(axis=0)
+    best = 0 if before > after else 2
+    share = np.mean(known[:, best] > known[:, 1])
+    if max(before, after) < max(min_score, min_ratio * own) or share < min_share:
+        return None
+    words = ("before", "late", "after") if best == 0 else ("after", "early", "before")
+    return (
+        f"{sequence.name}: depth is a frame {words[1]}: it fits the picture {words[0]} its own, so"
+        f" points are less exact; give each picture the depth image {words[2]} its own"
+    )
+
+
+def _score_neighbours(sequence: StereoSequence, row: int) -> tuple[float, float, float] | None:
+    """Return how well the depth of a frame fits the images before it, of it, and after it."""
+    frame, scores, near = sequence[row], list[float](), slice(_MAX_SHIFT - 2, _MAX_SHIFT + 3)
+    for other in (row - 1, row, row + 1):
+        found = _correlate_edges(replace(frame, image=sequence[other].image))
+        if found is None:
+            return None
+        scores.append(float(found[len(_ZOOMS) // 2, near, near].max()))
+    return scores[0], scores[1], scores[2]
 
 
 def _correlate_edges(frame: StereoFrame) -> Float[np.ndarray, "zooms s s"] | None:

@@ -3,7 +3,7 @@ residuals of SLAM in right images."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,20 +24,22 @@ from topoloc.recordings.recording import find_depth_units
 from topoloc.slam.keyframes import KeyFrame, Landmarks
 
 
-def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
+def check_stereo(sequence: StereoSequence) -> None:
     """Check that the left and right images of a recording are rectified pairs in the right order.
 
-    Features of `num_frames` pairs, spread over the recording, are matched over the whole images.
-    Other recordings, and pairs with too few matches, pass.
+    Features of some pairs, spread over the recording, are matched over the whole images. Other
+    recordings, and pairs with too few matches, pass.
 
     Raises:
         CalibrationError: the baseline cannot be in metres.
-        RecordingError: no frames; left and right are swapped, or no rectified pairs of one moment.
+        RecordingError: no frames; left and right are swapped, or no rectified pairs of one moment;
+            a stretch of it has no pairs, for a camera lost an image.
         UnreadableImageError: an image cannot be read.
     """
     max_baseline = 5.0  # metres; a larger one is assumed to be in millimetres
     # Maximum vertical distance of left and right points (median), pixels and share of the width.
     max_vertical_px, max_vertical_share = 0.9, 0.001
+    min_good_share = 0.15  # of the pairs, if others are none
     if not len(sequence):
         raise RecordingError(f"{sequence.name}: no frames")
     if (rig := sequence[0].rig) is None:
@@ -47,22 +49,74 @@ def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
             f"{sequence.name}: a baseline of {rig.baseline:g} m; is it in millimetres"
             f" ({rig.baseline / 1000:.4g} m) or centimetres ({rig.baseline / 100:.4g} m)?"
         )
-    chosen = np.unique(np.linspace(0, len(sequence) - 1, num_frames).astype(int)).tolist()
-    is_left, vertical = _compare_pairs(sequence[k] for k in chosen)
+    num_pairs = min(100, max(24, len(sequence) // 10))
+    rows = np.unique(np.linspace(0, len(sequence) - 1, num_pairs).astype(int)).tolist()
+    shifts = list(parallel_map(_match_pair, (sequence[k] for k in rows)))
+    is_left, vertical = _compare_pairs(shifts)
     is_pair = not vertical > max(max_vertical_px, max_vertical_share * rig.left.width)
     if not is_pair and is_left:  # rectified, swapped images are no pairs
-        is_left = not _compare_pairs(_exchange(sequence[k]) for k in chosen)[1] < 0.5 * vertical
+        exchanged = list(parallel_map(_match_pair, (_exchange(sequence[k]) for k in rows[::3])))
+        is_left = not _compare_pairs(exchanged)[1] < 0.5 * vertical
     if not is_left:
         raise RecordingError(
             f"{sequence.name}: left and right pictures are swapped: points lie further right in the"
             " right ones; exchange the two folders or topics"
         )
+    are_pairs = [_is_pair(one, rig.left.width) for one in shifts]
+    if is_pair or np.mean(are_pairs) > min_good_share:
+        _check_stretches(sequence, list(zip(rows, are_pairs, strict=True)))
     if not is_pair:
         raise RecordingError(
             f"{sequence.name}: left and right pictures are no pairs: the same points are"
             f" {vertical:.1f} px apart vertically (median); taken at different moments, or not"
             " rectified as calibrated?"
         )
+
+
+def _check_stretches(sequence: StereoSequence, checked: Sequence[tuple[int, bool]]) -> None:
+    """Raise RecordingError if two pairs in a row, or more, are none. Names the first frame."""
+    stretches, last = list[tuple[int, int]](), (-1, True)
+    for pair, following in zip(checked, [*checked[1:], (len(sequence), True)], strict=True):
+        is_alone = last[1] and following[1]  # one pair may have been matched wrongly
+        if not pair[1] and not is_alone:
+            if last[1]:
+                stretches.append((_find_change(sequence, last[0], pair[0]), 0))
+            if following[1]:
+                end = _find_change(sequence, following[0], pair[0])
+                stretches[-1] = stretches[-1][0], end
+        last = pair
+    if not stretches:
+        return
+    edges = [0, *(edge for stretch in stretches for edge in stretch), len(sequence)]
+    parts = zip(edges[::2], edges[1::2], strict=True)
+    others = ",".join(f"{first}:{end}" for first, end in parts if first < end)
+    first, end = stretches[0]
+    raise RecordingError(
+        f"{sequence.name}: left and right pictures of frames {first} to {end - 1} are no pairs of"
+        f" one moment: a camera lost a picture at {sequence.names[first]}, or its clock jumped;"
+        f" remove the picture without a partner, or map the others: {sequence.name}@{others}"
+    )
+
+
+def _find_change(sequence: StereoSequence, good: int, bad: int) -> int:
+    """Return where a stretch without pairs begins, or ends (exclusive), between a row with a pair
+    and one without."""
+    rig = sequence[bad].rig
+    while rig is not None and abs(good - bad) > 1:
+        middle = (good + bad) // 2
+        if _is_pair(_match_pair(sequence[middle]), rig.left.width):
+            good = middle
+        else:
+            bad = middle
+    return max(good, bad)
+
+
+def _is_pair(shifts: Float[np.ndarray, "n 2"], width: int) -> bool:
+    """Return whether two images may be a pair. Right pairs of KITTI, ZED and EuRoC are up to 0.7 px
+    apart, those of two moments 3 to 14 px."""
+    min_matches, max_px, max_share = 30, 2.0, 0.002
+    vertical = np.median(np.abs(shifts[:, 1])) if len(shifts) >= min_matches else 0.0
+    return bool(vertical < max(max_px, max_share * width))
 
 
 def _exchange(frame: StereoFrame) -> StereoFrame:
@@ -103,11 +157,11 @@ def add_calibration(looks: str, sequence: StereoSequence, conventions: Sequence[
     return f"{looks}; or, {explains}" if unit in UNITS else f"{explains}; otherwise {looks}"
 
 
-def _compare_pairs(frames: Iterable[StereoFrame]) -> tuple[bool, float]:
+def _compare_pairs(matched: Sequence[Float[np.ndarray, "_ 2"]]) -> tuple[bool, float]:
     """Return whether the points of left images lie further left in the right ones, as they must,
     and how far they are apart vertically (median, pixels). Too few matches give True and NaN."""
     min_matches, min_shift_px, max_swapped_share = 40, 1.5, 0.8
-    shifts = np.concatenate(list(parallel_map(_match_pair, frames)))
+    shifts = np.concatenate(matched)
     if len(shifts) < min_matches:
         return True, float("nan")
     moved = shifts[np.abs(shifts[:, 0]) > min_shift_px, 0]

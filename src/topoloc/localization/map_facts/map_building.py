@@ -25,6 +25,7 @@ from topoloc.mapping.config import Progress
 from topoloc.mapping.storage.entries import CorrelatedErrors
 from topoloc.mapping.topomap import Repetitions, TopoMetricMap
 from topoloc.node_ids import NodeId
+from topoloc.recordings.depth_range import leave_out_stuck_depth
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import leave_out_damaged
@@ -33,6 +34,7 @@ from topoloc.slam.input_checks import check_pose_coverage, check_stereo
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
+from topoloc.slam.still_part import find_still_part
 
 
 def build_map(
@@ -74,7 +76,7 @@ def build_map(
     several = [sequences] if isinstance(sequences, StereoSequence | str | Path) else sequences
     warn = warn or warnings.warn
     opened = [open_sequence(one) if isinstance(one, str | Path) else one for one in several]
-    sequences = [leave_out_damaged(one, warn) for one in opened]
+    sequences = [leave_out_stuck_depth(leave_out_damaged(one, warn), warn) for one in opened]
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
         sequences = run_slam(sequences, progress, warn).apply(sequences)
         poses_from = ["slam"] * len(sequences)
@@ -82,8 +84,9 @@ def build_map(
     given = [one for one, source in zip(sequences, sources, strict=True) if source != "slam"]
     for sequence in given:
         check_stereo(sequence)
-        if (note := find_depth_shift(sequence)) is not None:
-            warn(note)
+        for note in (find_still_part(sequence), find_depth_shift(sequence)):
+            if note is not None:
+                warn(note)
         if is_coverage_checked:
             check_pose_coverage(sequence)
         if are_poses_checked:
