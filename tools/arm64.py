@@ -58,7 +58,8 @@ def main() -> int:
 def emulate(root: Path, emulator: str, *arguments: object) -> int:
     """Run ROOT's Python with these arguments. Return its exit status."""
     # the sources come first; of the installed project only its metadata are read
-    folders = HERE / "src", HERE / "worlds" / "src", root / "site"
+    parts = (HERE / part / "src" for part in (".", "worlds", "paper", "training"))
+    folders = *parts, root / "site"
     variables = {
         "PYTHONPATH": os.pathsep.join(map(str, folders)),
         "PYTHONDONTWRITEBYTECODE": "1",
