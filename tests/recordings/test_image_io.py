@@ -2,8 +2,10 @@ import os
 import struct
 import subprocess
 import sys
+import unicodedata
 import zlib
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,7 +16,7 @@ from peak_memory import PEAK_KB
 from tiny_recordings import picture, write
 from topoloc.errors import UnreadableImageError
 from topoloc.recordings.frame import to_grey
-from topoloc.recordings.image_io import image_size, read_depth, read_image
+from topoloc.recordings.image_io import image_size, read_depth, read_depth_image, read_image
 
 pytestmark = pytest.mark.usefixtures("quiet")
 
@@ -92,6 +94,48 @@ def test_exif_orientation_is_obeyed(tmp_path: Path):
     np.testing.assert_allclose(
         read_image(path).astype(int), np.rot90(upright, -1).astype(int), atol=2
     )
+
+
+@pytest.mark.parametrize(
+    ("pixels", "says"),
+    [
+        (
+            np.array([[[0.1, 0.5, 1.0]]], np.float32),
+            "pixels of 32-bit floats; a picture needs integers",
+        ),
+        (np.array([[0.1, 0.5]], np.float64), "pixels of 64-bit floats"),
+        (np.array([[0.1, 0.5]], np.float32), "pixels of 32-bit floats"),
+        (np.array([[[1, 2, 3]]], np.int32), "pixels of 32-bit signed integers"),
+    ],
+)
+def test_pixels_of_a_whole_tiff_that_are_not_read_are_named(
+    pixels: np.ndarray, says: str, tmp_path: Path
+):
+    path = write(tmp_path / "a.tiff", pixels)
+    with pytest.raises(UnreadableImageError, match=says):
+        read_image(path)
+
+
+def test_a_tiff_that_ends_early_is_damaged(tmp_path: Path):
+    path = write(tmp_path / "a.tiff", smooth(3))
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(UnreadableImageError, match="damaged"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(("stored", "listed"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_names_in_another_form_of_unicode_are_found(
+    stored: Literal["NFC", "NFD"], listed: Literal["NFC", "NFD"], tmp_path: Path
+):
+    """Also of folders in between, and of depth. A missing file keeps its name."""
+    names = [unicodedata.normalize(form, "Küche/é_1") for form in (stored, listed)]
+    (path, other) = (tmp_path / f"{name}.png" for name in names)
+    write(path, picture(1))
+    np.save(path.with_suffix(".npy"), np.full((2, 2), 1500.0))
+    np.testing.assert_array_equal(read_image(other), read_image(path))
+    np.testing.assert_array_equal(read_depth_image(other.with_suffix(".npy"), 1000.0), 1.5)
+    with pytest.raises(UnreadableImageError, match=r"é_2\.png: no such picture"):
+        read_image(tmp_path / "é_2.png")
 
 
 def test_heic_is_read_with_its_decoder(tmp_path: Path):
@@ -193,12 +237,6 @@ def test_too_large_is_refused_before_it_is_decoded(tmp_path: Path):
         read_image(tmp_path / "bomb.png")
     with pytest.raises(UnreadableImageError, match="megapixels"):
         image_size(tmp_path / "bomb.png")
-
-
-def test_floating_point_pixels_are_refused(tmp_path: Path):
-    path = write(tmp_path / "a.tiff", np.ones((4, 4), np.float32))
-    with pytest.raises(UnreadableImageError, match="float32"):
-        read_image(path)
 
 
 def test_depth_in_metres_unknown_is_nan(tmp_path: Path):

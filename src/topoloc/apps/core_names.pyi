@@ -20,10 +20,14 @@ from topoloc.recordings.atomic import (
     temporary_folder as temporary_folder,
 )
 from topoloc.recordings.calibration import (
+    CalibrationForSize as CalibrationForSize,
+    first_image_size as first_image_size,
     parse_calibration as parse_calibration,
     replace_cameras as replace_cameras,
+    with_calibration as with_calibration,
 )
 from topoloc.recordings.formats.video import silence_opencv as silence_opencv
+from topoloc.recordings.image_files import find_path as find_path
 from topoloc.recordings.image_io import (
     MAX_PIXELS as MAX_PIXELS,
     exif_focal_length as exif_focal_length,

@@ -1,8 +1,8 @@
 """Read calibrations and apply them to recordings.
 
-A calibration is a `camera.json`, YAML of OpenCV, Kalibr, ROS, VINS or ORB-SLAM, or four numbers
-``fx,fy,cx,cy`` in pixels. Four numbers and some files do not contain the image size. So a
-calibration is a function of the size of the images.
+A calibration is a `camera.json`, YAML of OpenCV, Kalibr, ROS, VINS or ORB-SLAM, a file of
+`other_cameras.py`, or four numbers ``fx,fy,cx,cy`` in pixels. Four numbers and some files do not
+contain the image size. So a calibration is a function of the size of the images.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ from topoloc.recordings.camera_files import (
 from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import image_size
+from topoloc.recordings.other_cameras import read_other_camera
 from topoloc.recordings.recording import Recording
 from topoloc.recordings.slam_settings import camera_files, read_slam_settings
+from topoloc.recordings.text_files import read_text
 
 CalibrationForSize = Callable[[int, int], CameraCalibration]
 """Returns the calibration for images of this width and height (pixels). Raises CalibrationError."""
@@ -49,9 +51,22 @@ def parse_calibration(text: str | Path, allow_files: bool = True) -> Calibration
     path = Path(text)
     if not allow_files or ("," in str(text) and not os.path.exists(path)):
         return _parse_intrinsics(str(text))
-    if path.suffix.lower() in YAML_SUFFIXES:
+    if path.suffix.lower() in YAML_SUFFIXES or is_calibration(path):
         _read_yaml_calibration(path, 1000, 1000)  # raises errors before the first image is read
         return lambda width, height: _read_yaml_calibration(path, width, height)
+    if path.name == "cameras.bin":
+        raise CalibrationError(
+            f"{path}: not a text file; `colmap model_converter --output_type TXT` writes"
+            " cameras.txt of it"
+        )
+    text = read_text(path, CalibrationError, "no such camera file")
+    if calibration := read_other_camera(path, text, camera_from_intrinsics):
+        return calibration
+    if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
+        raise CalibrationError(
+            f"{path}: no known calibration; write a camera.json (docs/recordings.md), or give"
+            " fx,fy,cx,cy"
+        )
     camera_calibration = read_camera_json(path)
     return lambda width, height: camera_calibration
 

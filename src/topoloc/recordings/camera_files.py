@@ -93,6 +93,8 @@ _DISTORTIONS = {
     "equidistant": ("OPENCV_FISHEYE", 4),
     "none": ("PINHOLE", 0),
 }
+# Kalibr's camera models that are not read
+_KALIBR_MODELS = {"ds": "double sphere", "eucm": "extended unified", "omni": "Mei's unified"}
 _FISHEYE_WORDS = ("equidistant", "fisheye", "KANNALA_BRANDT")
 # names of the camera matrix and the distortion of the left, the right, and a single camera
 _LEFT_KEYS = tuple(
@@ -230,11 +232,14 @@ def _ros_calibration(path: Path, size: tuple[float, float]) -> RosCalibration:
 def kalibr_camera(path: Path, section: str) -> Camera:
     """Read the camera of a sensor.yaml, or of a section of a camchain. Raises CalibrationError."""
     distortion = yaml_word(section, "distortion_model", "none")
-    if yaml_word(section, "camera_model", "pinhole") != "pinhole" or distortion not in _DISTORTIONS:
-        known = ", ".join(_DISTORTIONS)
+    kind, known = yaml_word(section, "camera_model", "pinhole"), ", ".join(_DISTORTIONS)
+    remedy = "calibrate with Kalibr's --models pinhole-equi, or pinhole-radtan for a narrow lens"
+    if kind != "pinhole":
+        name = f" ({_KALIBR_MODELS[kind]})" if kind in _KALIBR_MODELS else ""
+        raise CalibrationError(f"{path}: camera_model {kind}{name} is not known here; {remedy}")
+    if distortion not in _DISTORTIONS:
         raise CalibrationError(
-            f"{path}: distortion_model {distortion} is not one of {known}, or camera_model is not"
-            " pinhole"
+            f"{path}: distortion_model {distortion} is not one of {known}; {remedy}"
         )
     model, count = _DISTORTIONS[distortion]
     width, height = require_numbers(path, section, 2, "resolution")

@@ -41,6 +41,7 @@ from topoloc.errors import MissingExtraError, RecordingError, UnreadableImageErr
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import DepthImage, Image, find_depth_problem
+from topoloc.recordings.image_files import find_path, unknown_pixels_reason, unreadable_reason
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".heic", ".heif"}
@@ -98,7 +99,7 @@ def read_image(
             values = np.array(picture).astype(np.uint16)
             return cv2.convertScaleAbs(values, alpha=255.0 / (white or _white_level(values)))
         if picture.mode == "F":
-            raise UnreadableImageError(f"{path}: pixels of type float32, not of 8 or 16 bits")
+            raise UnreadableImageError(f"{path}: {unknown_pixels_reason('32-bit floats')}")
         return np.array(picture if picture.mode == "RGB" else picture.convert("RGB"))
 
 
@@ -200,6 +201,7 @@ def _read_bytes(path: Path | EncodedImage) -> bytes:
     try:
         if isinstance(path, EncodedImage):
             return path.data
+        path = find_path(path)
         # Reading a FIFO would block.
         if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
             raise UnreadableImageError(f"{path}: not a file")
@@ -227,7 +229,7 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
             picture.verify()
             picture = Pillow.open(io.BytesIO(data), formats=types)
     except Pillow.UnidentifiedImageError:
-        raise UnreadableImageError(f"{path}: {_unreadable_reason(data)}") from None
+        raise UnreadableImageError(f"{path}: {unreadable_reason(data)}") from None
     except Pillow.DecompressionBombError:
         raise UnreadableImageError(
             f"{path}: more than {MAX_PIXELS // 1_000_000} megapixels"
@@ -293,15 +295,6 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _unreadable_reason(data: bytes) -> str:
-    starts = {b"\x89PNG": "PNG", b"\xff\xd8": "JPEG", b"BM": "BMP", b"RIFF": "WebP"}
-    starts |= {b"II*\0": "TIFF", b"MM\0*": "TIFF"}
-    known = next((name for start, name in starts.items() if data.startswith(start)), None)
-    if known is not None:
-        return f"damaged or truncated {known} file"
-    return "not a picture, or not of a known type (PNG, JPEG, BMP, PNM, TIFF, WebP, HEIC)"
-
-
 def read_depth_image(path: Path, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
     """Read depth along z in metres. Unknown depth is NaN (0 in the file, and 65535 of 16 bits).
 
@@ -310,7 +303,7 @@ def read_depth_image(path: Path, units_per_metre: float) -> Float32[np.ndarray, 
         RecordingError: the median depth is implausible, so `units_per_metre` must be wrong.
         MissingExtraError: the file is EXR and the extra `exr` is not installed.
     """
-    suffix = path.suffix.lower()
+    path, suffix = find_path(path), path.suffix.lower()
     if suffix in (".exr", ".npy"):
         units = _read_exr(path) if suffix == ".exr" else _read_npy(path)
         with np.errstate(invalid="ignore", over="ignore"):

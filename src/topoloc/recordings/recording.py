@@ -25,6 +25,7 @@ from topoloc.recordings.frame import (
     StereoSequence,
     sequence_subset,
 )
+from topoloc.recordings.image_files import find_path
 from topoloc.recordings.image_io import (
     depth_image_of,
     exif_focal_length,
@@ -273,7 +274,7 @@ def _is_damaged(path: Path) -> bool:
     """Return whether an image or depth image is missing, empty or truncated. PNG and JPEG that end
     as their format does are not decoded. The end of a thumbnail may stand before it."""
     ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
-    with suppress(OSError), path.open("rb") as file:
+    with suppress(OSError), find_path(path).open("rb") as file:
         start = file.read(4)
         file.seek(max(0, file.seek(0, os.SEEK_END) - 8))
         tail = file.read()

@@ -18,6 +18,7 @@ from topoloc.apps.cli import main
 from topoloc.apps.cli.output import check_outputs, print_fields, progress_bar, write_text
 from topoloc.apps.cli.queries.query_answers import QueryAnswer, format_answer
 from topoloc.errors import TopolocError
+from topoloc.mapping.storage.entries import today
 
 
 class _Terminal(io.StringIO):
@@ -159,6 +160,37 @@ def test_a_closed_output_is_no_error(room_map: Path):
         [sys.executable, "-c", close, *command], stderr=subprocess.PIPE, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("closed", [(2,), (0, 1, 2)])
+def test_the_null_device_takes_the_place_of_closed_streams(closed: tuple[int, ...]):
+    """A file that is opened later must not get their numbers, nor in a child."""
+    close = f"import os, sys; [os.close(n) for n in {closed}]; os.execv(sys.argv[1], sys.argv[1:])"
+    run = (
+        "import os, sys; from topoloc.apps.cli import main; main(['-V']); sys.stderr.isatty();"
+        " null = os.stat(os.devnull)\n"
+        f"for n in {closed}: assert os.path.samestat(os.fstat(n), null) and os.get_inheritable(n)"
+    )
+    command = [sys.executable, "-c", close, sys.executable, "-c", run]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("value", "is_kept", "num_lines"),
+    [("1700000000", True, 0), ("", False, 0), ("1e9", False, 1), ("1700000000000", False, 1)],
+)
+def test_a_date_that_is_no_time_is_dropped_before_the_work(
+    value: str,
+    is_kept: bool,
+    num_lines: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", value)
+    assert len(today()) == 10  # also of the library
+    assert main(["-V"]) == 0
+    assert ("SOURCE_DATE_EPOCH" in os.environ) == is_kept
+    assert len(capsys.readouterr().err.splitlines()) == num_lines
 
 
 def test_a_printed_refusal_has_its_reason_in_one_short_line():

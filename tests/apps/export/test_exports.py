@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,11 @@ from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image as Pillow
 
 from topoloc.apps.cli import main
+from topoloc.apps.export.formats import to_ply
+from topoloc.apps.export.foxglove import to_mcap
 from topoloc.apps.viewer.map_scene import create_map_scene
-from topoloc.apps.viewer.scene import Scene
+from topoloc.apps.viewer.scene import Points, Scene
+from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
 
 PLACE = "48.2,16.37,170,30"
@@ -164,6 +168,30 @@ def test_trimesh_reads_the_points(placed_map: Path, scene: Scene, tmp_path: Path
     cloud = trimesh.load(export(placed_map, tmp_path / "room.ply"))
     np.testing.assert_allclose(cloud.vertices, scene.points.world, atol=1e-5)
     np.testing.assert_array_equal(cloud.colors[:, :3], scene.points.rgb)
+
+
+@pytest.mark.parametrize("offset", [(512345.678, 5412345.678, 345.6), (4.08e6, 1.2e6, 4.73e6)])
+def test_points_in_coordinates_of_the_earth_are_exact(scene: Scene, offset: tuple[float, ...]):
+    """UTM, ECEF: 32 bits would round to 0.25 m."""
+    world = scene.points.world + np.array(offset)
+    far = replace(scene, points=replace(scene.points, world=world))
+    header, _, body = to_ply(far).partition(b"end_header\n")
+    assert header.count(b"property double") == 3
+    vertices = np.frombuffer(body, [("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    np.testing.assert_array_equal(vertices["xyz"], world)
+    np.testing.assert_array_equal(vertices["rgb"], scene.points.rgb)
+    reader = make_reader(io.BytesIO(to_mcap(far)), decoder_factories=[DecoderFactory()])
+    ((*_, points),) = reader.iter_decoded_messages(["/points"])
+    xyz = np.frombuffer(points.data, np.float32).reshape(-1, points.point_stride // 4)[:, :3]
+    origin = [getattr(points.pose.position, name) for name in "xyz"]
+    np.testing.assert_allclose(xyz + np.array(origin), world, rtol=0.0, atol=1e-5)
+
+
+def test_positions_of_results_in_coordinates_of_the_earth(scene: Scene):
+    pose = Rigid3(np.eye(3), np.array([512345.678, 5412345.678, 345.6]))
+    path = replace(scene, points=Points.none(), trajectory=[pose])
+    body = to_ply(path).partition(b"end_header\n")[2]
+    np.testing.assert_array_equal(np.frombuffer(body[:24], "<f8"), pose.translation)
 
 
 def test_evo_reads_trajectories(placed_map: Path, results: Path, scene: Scene, tmp_path: Path):

@@ -159,6 +159,67 @@ def test_fisheye(capture: Make):
     )
 
 
+@pytest.mark.parametrize(
+    ("angles", "focal"),
+    [
+        ({"camera_angle_x": 0.8}, (37.844, 37.844)),
+        ({"camera_angle_y": 0.6}, (38.793, 38.793)),
+        ({"camera_angle_x": 0.8, "camera_angle_y": 0.6, "w": WIDTH, "h": HEIGHT}, (37.844, 38.793)),
+    ],
+)
+@pytest.mark.parametrize("is_per_frame", [False, True])
+def test_viewing_angles_of_blender(
+    capture: Make, angles: dict[str, Any], focal: tuple[float, float], is_per_frame: bool
+):
+    """The file lies among others of its scene, and names images without a suffix."""
+
+    def change(data: dict[str, Any]) -> None:
+        frames = [
+            {
+                "file_path": frame["file_path"].removesuffix(".png"),
+                "transform_matrix": frame["transform_matrix"],
+                **(angles if is_per_frame else {}),
+            }
+            for frame in data["frames"]
+        ]
+        data.clear()
+        data |= {"frames": frames} | ({} if is_per_frame else angles)
+
+    folder = capture(change, depth_scale=None)
+    (folder / "images" / "frame_2.png").rename(folder / "images" / "frame_2.jpg")
+    (folder / "transforms.json").rename(folder / "transforms_train.json")
+    sequence = open_sequence(folder)
+    camera = sequence[0].camera
+    assert camera is not None
+    assert camera.params == pytest.approx((*focal, 15.5, 11.5), abs=1e-3)
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    assert sequence[1].name == "images/frame_2.jpg"
+    assert len(open_sequence(folder / "transforms_train.json")) == 3
+
+
+@pytest.mark.parametrize("suffix", ["", ".png"])
+def test_names_that_a_mac_has_decomposed(capture: Make, suffix: str):
+    def change(data: dict[str, Any]) -> None:
+        for number, frame in enumerate(data["frames"]):
+            frame["file_path"] = f"./images/K\u00fcche_{number}{suffix}"
+
+    folder = capture(change, depth_scale=None)
+    for number, file in enumerate(sorted((folder / "images").iterdir())):
+        file.rename(folder / "images" / f"Ku\u0308che_{number}.png")
+    sequence = open_sequence(folder, whole_only=True)
+    assert sequence[2].name == "images/K\u00fcche_2.png"
+
+
+def test_a_given_camera_replaces_that_of_the_file(capture: Make):
+    for keys in (("fl_x",), tuple(LENS)):
+        folder = capture(lambda data, keys=keys: [data.pop(key) for key in keys])
+        with pytest.raises(CalibrationError, match="neither fl_x nor camera_angle_x"):
+            open_sequence(folder)
+        frame = open_sequence(folder, camera="30,31,15.5,11.5")[0]
+        assert frame.camera == Camera("PINHOLE", WIDTH, HEIGHT, (30.0, 31.0, 15.5, 11.5))
+        assert frame.depth is not None
+
+
 def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
     return lambda data: data["frames"][1].update(transform_matrix=value)
 
@@ -182,6 +243,11 @@ def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
             "camera_model: Invalid enum value 'EQUIRECTANGULAR'",
         ),
         (lambda data: data.pop("cx"), CalibrationError, "missing required field `cx`"),
+        (
+            lambda data: [data.pop("fl_x"), data.update(camera_angle_x=40.0)],
+            CalibrationError,
+            "camera_angle_x: Expected `float` < 3.14",
+        ),
         (
             lambda data: data.update(fl_x="wide"),
             CalibrationError,

@@ -213,7 +213,11 @@ def test_several_calibrations_and_other_yaml(pairs: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda text: text.replace("pinhole", "omni"), "camera_model is not pinhole"),
+        (
+            lambda text: text.replace("pinhole", "omni"),
+            r"camera_model omni .*--models pinhole-equi",
+        ),
+        (lambda text: text.replace("pinhole", "ds"), r"camera_model ds \(double sphere\)"),
         (lambda text: text.replace("radtan", "fov"), "distortion_model fov is not one of"),
         (lambda text: text.replace("T_cn_cnm1", "T_other"), "T_cn_cnm1 with 16 numbers is missing"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import select
@@ -88,6 +89,33 @@ def test_invalid_images_are_refused(client: httpx.Client, view: Path, kind: str)
     data, status = _pictures(view)[kind]
     _check(client.post(LOCALIZE, files={"image": ("picture.jpg", data)}), status)
     _check(client.post(LOCALIZE, content=data, headers={"content-type": "image/jpeg"}), status)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WEBP", "BMP", "TIFF"])
+def test_base64_is_named_with_a_remedy(client: httpx.Client, view: Path, kind: str):
+    """As the body, in JSON, as a file or as a text of a form, alone and as an address of data."""
+    file = io.BytesIO()
+    Image.open(view).convert("L").resize((64, 48)).save(file, kind)
+    encoded = base64.b64encode(file.getvalue()).decode()
+    for text in (encoded, f"data:image/{kind.lower()};base64,{encoded}", json.dumps(encoded)):
+        image = {"content-type": f"image/{kind.lower()}"}
+        long = text * (1 + 20_000 // len(text))
+        for answer, status in (
+            (client.post(LOCALIZE, content=text, headers=image), 415),
+            (client.post(LOCALIZE, files={"image": ("picture", text.encode())}), 415),
+            (client.post(LOCALIZE, files={"image": (None, text)}), 400),
+            (client.post(LOCALIZE, files={"image": (None, long)}), 400),
+        ):
+            said = _check(answer, status)
+            assert "not base64: as the body (Content-Type: image/...)" in said
+    said = _check(client.post(LOCALIZE, json={"image": encoded, "camera": "1,1,1,1"}), 415)
+    assert "JSON, not an image; send the bytes of the image file" in said
+
+
+def test_an_image_of_letters_is_no_base64(client: httpx.Client):
+    """A PNM may hold nothing but text."""
+    body = b"P2\n64 48\n255\n" + b"9 " * (64 * 48)
+    assert client.post(LOCALIZE, content=body).status_code == 200
 
 
 def test_a_slow_client_that_sends_too_much_gets_the_reason(service: Running):

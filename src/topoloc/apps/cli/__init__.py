@@ -12,6 +12,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from io import TextIOWrapper
 from os import PathLike
 from typing import Any, TextIO
@@ -98,8 +99,8 @@ MIN_ADDRESS_SPACE = 1_600_000_000
 def main(args: list[str] | None = None) -> int:
     """Run one command. Return the exit status: 0 done, 1 a known failure (one line on stderr), 2
     wrong usage."""
-    if sys.stdout is None:  # closed by the caller; a file must not get its number
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    _open_closed_streams()
+    _drop_unreadable_date()
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # code pages lack letters of file names
     try:
@@ -116,6 +117,28 @@ def main(args: list[str] | None = None) -> int:
         _discard_output(sys.stdout)
         _print_error(f"cannot write the output: {error.strerror}")
     return 1
+
+
+def _open_closed_streams() -> None:
+    """Open the null device for each standard stream that the caller closed. A file must not get its
+    number, here or in a child."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
+
+
+def _drop_unreadable_date() -> None:
+    """Remove a SOURCE_DATE_EPOCH that is no time. NumPy raises an error for it when imported."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "").strip()
+    try:
+        datetime.fromtimestamp(int(epoch or 0), UTC)
+    except (ValueError, OverflowError, OSError):
+        _print_line(f"warning: SOURCE_DATE_EPOCH {epoch!r} is not in seconds: today's date is used")
+        epoch = ""
+    if not epoch:
+        os.environ.pop("SOURCE_DATE_EPOCH", None)
 
 
 def _dispatch(args: list[str]) -> int:

@@ -51,7 +51,7 @@ CameraOption = Annotated[
         "FILE|fx,fy,cx,cy",
         "that of the recording",
         help="Calibration that replaces the recordings' own: camera.json, OpenCV's or Kalibr's"
-        " YAML, SN*.conf, or `fx,fy,cx,cy`.",
+        " YAML, COLMAP's cameras.txt, SN*.conf, or `fx,fy,cx,cy`.",
     ),
 ]
 Topics = Annotated[

@@ -33,6 +33,7 @@ from topoloc.plugin import write_bytes, write_folder
 _CAMERA_RGB = (255, 0, 0)
 _CAM_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _POINTS_FILE = "sparse_pc.ply"
+_MAX_FLOAT_M = 1000.0  # where 32 bits have steps of 0.06 mm
 
 
 def export(path: str | Path, out: str | Path, format: str | None = None) -> None:
@@ -79,18 +80,19 @@ def to_kitti(scene: Scene) -> bytes:
 
 def to_ply(scene: Scene) -> bytes:
     """Return the points with their colours, binary little-endian. Without points, return the
-    positions of the trajectory in red."""
+    positions of the trajectory in red. Coordinates of the earth (UTM, ECEF) need doubles."""
     world, rgb = scene.points.world, scene.points.rgb
     if len(world) == 0:
         world = np.array([pose.translation for pose in scene.trajectory])
         rgb = np.tile(np.array(_CAMERA_RGB, np.uint8), (len(world), 1))
-    vertices = np.zeros(len(world), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    is_far = np.abs(world).max(initial=0.0) > _MAX_FLOAT_M
+    vertices = np.zeros(len(world), [("xyz", "<f8" if is_far else "<f4", 3), ("rgb", "u1", 3)])
     vertices["xyz"], vertices["rgb"] = world, rgb
     header = [
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(world)}",
-        *(f"property float {name}" for name in "xyz"),
+        *(f"property {'double' if is_far else 'float'} {name}" for name in "xyz"),
         *(f"property uchar {name}" for name in ("red", "green", "blue")),
         "end_header",
         "",

@@ -97,7 +97,8 @@ def _view_messages(view: View, t_ns: int) -> Iterator[tuple[str, Any]]:
 def _to_point_cloud(scene: Scene, t_ns: int) -> Any:
     element = _schema("PackedElementField")
     points = np.zeros(len(scene.points.world), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
-    points["xyz"], points["rgba"] = scene.points.world, 255
+    origin = scene.points.world.mean(axis=0).round()  # 32 bits are too few for those of the earth
+    points["xyz"], points["rgba"] = scene.points.world - origin, 255
     points["rgba"][:, :3] = scene.points.rgb
     fields = [
         element(name=name, offset=4 * k, type=element.FLOAT32) for k, name in enumerate("xyz")
@@ -106,7 +107,9 @@ def _to_point_cloud(scene: Scene, t_ns: int) -> Any:
         for k, name in enumerate(("red", "green", "blue", "alpha"))
     ]
     content = {"point_stride": points.itemsize, "fields": fields, "data": points.tobytes()}
-    return _message("PointCloud", t_ns, MAP_FRAME, pose=_to_pose(Rigid3.identity()), **content)
+    return _message(
+        "PointCloud", t_ns, MAP_FRAME, pose=_to_pose(Rigid3(np.eye(3), origin)), **content
+    )
 
 
 def _to_timestamp(t_ns: int) -> Any:

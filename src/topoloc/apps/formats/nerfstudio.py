@@ -3,6 +3,8 @@
 ``transform_matrix`` is world_from_cam with OpenGL's camera axes (y up, z back), in metres if the
 program knows them; `applied_scale` is removed. `fl_x fl_y cx cy w h` and the distortion of OpenCV
 stand in the file or in each frame. As in COLMAP the centre of the top-left pixel is (0.5, 0.5).
+Files of Blender have `camera_angle_x` (radians) instead: the focal length, with the centre and the
+size of the images. Their names are `transforms_train.json` and the like.
 Depth is along z, with the view of the image, in units of `depth_unit_scale_factor` metres (default
 0.001, as in nerfstudio). NeRFCapture writes `depth_path` and `integer_depth_scale` (metres). Frames
 are in the order of their names and have no times: 10 a second.
@@ -10,13 +12,29 @@ are in the order of their names and have no times: 10 a second.
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from topoloc import CalibrationError, Camera, PoseConventions, RecordingError, Rigid3
+from topoloc import (
+    CalibrationError,
+    Camera,
+    PoseConventions,
+    RecordingError,
+    Rigid3,
+    StereoSequence,
+)
+from topoloc.apps.core_names import (
+    CalibrationForSize,
+    find_path,
+    first_image_size,
+    with_calibration,
+)
 from topoloc.plugin import (
     DepthImages,
     Finite,
@@ -29,7 +47,8 @@ from topoloc.plugin import (
     times_from_rate,
 )
 
-FILE_NAME = "transforms.json"
+_FILE_NAMES = "transforms.json", "transforms_train.json"
+_SUFFIXES = "", ".png", ".jpg", ".jpeg"
 EXPECTED_FILES = "transforms.json of nerfstudio"
 DEPTH_UNIT = 0.001
 """Metres: nerfstudio's default of `depth_unit_scale_factor`."""
@@ -37,15 +56,22 @@ DEPTH_UNIT = 0.001
 
 def can_open(path: Path) -> bool:
     """Return whether this is a transforms.json, or a folder with one."""
-    return path.name == FILE_NAME if path.is_file() else (path / FILE_NAME).is_file()
+    if path.is_file():
+        return path.name.startswith("transforms") and path.suffix == ".json"
+    return _find_file(path).is_file()
 
 
-def open_nerfstudio(path: Path) -> Recording:
-    """Open a folder with a transforms.json, or the file itself. Frames with depth are RGB-D. Raises
-    RecordingError: there are no frames, only some have depth, the file is malformed, a matrix is no
-    pose, or a name leads out of the folder; CalibrationError: a key of the camera is missing or
-    invalid, or its model is unknown."""
-    file = path if path.is_file() else path / FILE_NAME
+def _find_file(path: Path) -> Path:
+    files = [path / name for name in _FILE_NAMES]
+    return path if path.is_file() else next((file for file in files if file.is_file()), files[0])
+
+
+def open_nerfstudio(path: Path, calibration: CalibrationForSize | None = None) -> StereoSequence:
+    """Open a folder with a transforms.json, or the file itself. Frames with depth are RGB-D.
+    `calibration` replaces that of the file. Raises RecordingError: there are no frames, only some
+    have depth, the file is malformed, a matrix is no pose, or a name leads out of the folder;
+    CalibrationError: a key of the camera is missing or invalid, or its model is unknown."""
+    file = _find_file(path)
     data = decode_json(read_text(file, RecordingError), dict[str, Any], RecordingError, str(file))
     whole = decode_json(data, _File, RecordingError, str(file))
     read = [
@@ -60,11 +86,17 @@ def open_nerfstudio(path: Path) -> Recording:
     names = [_with_suffix(file.parent, name) for name, _, _ in named]
     where, frames = [f"{file}, {name}" for name in names], [frame for _, frame, _ in named]
     poses: list[Rigid3 | None] = [_pose(frame, whole.applied_scale) for frame in frames]
-    # Keys of the file take precedence, as in nerfstudio.
-    cameras = [_camera(lens | data, at) for (_, _, lens), at in zip(named, where, strict=True)]
     depth = _depth(frames, whole.integer_depth_scale or whole.depth_unit_scale_factor, file, where)
-    name, t_ns = file.parent.resolve().name, times_from_rate(len(names))
-    return Recording.with_cameras(name, file.parent, names, t_ns, poses, cameras, depth=depth)
+    place = file.parent.resolve().name, file.parent, names, times_from_rate(len(names)), poses
+    if calibration is not None:
+        return with_calibration(Recording(*place, None, depth=depth), calibration)
+    size = cache(lambda: first_image_size([file.parent / name for name in names]))
+    # Keys of the file take precedence, as in nerfstudio.
+    cameras = [
+        _camera(_with_defaults(lens | data, size, at), at)
+        for (_, _, lens), at in zip(named, where, strict=True)
+    ]
+    return Recording.with_cameras(*place, cameras, depth=depth)
 
 
 _Factor = Annotated[float, Meta(gt=1e-12, lt=1e12)]
@@ -112,6 +144,33 @@ class _Lens(Struct, frozen=True):
     ] = "OPENCV"
 
 
+_Angle = Annotated[float, Meta(gt=0, lt=math.pi)] | None
+
+
+class _View(Struct, frozen=True):
+    w: Finite | None = None
+    h: Finite | None = None
+    camera_angle_x: _Angle = None
+    camera_angle_y: _Angle = None
+
+
+def _with_defaults(
+    data: dict[str, Any], size: Callable[[], tuple[int, int]], where: str
+) -> dict[str, Any]:
+    """Return the keys of a camera with those that the file leaves out: the size of the images, and
+    the focal length of a viewing angle, with the centre, as in Blender and instant-ngp."""
+    view = decode_json(data, _View, CalibrationError, where)
+    w, h = (view.w, view.h) if view.w and view.h else size()
+    given = {"w": w, "h": h} | data
+    angles = {"fl_x": (w, view.camera_angle_x), "fl_y": (h, view.camera_angle_y)}
+    focal = {
+        key: 0.5 * side / math.tan(0.5 * angle) for key, (side, angle) in angles.items() if angle
+    }
+    if "fl_x" in data or not focal:
+        return given
+    return {"cx": 0.5 * w, "cy": 0.5 * h, "fl_x": focal.get("fl_y")} | focal | given
+
+
 def _pose(frame: _Frame, scale: float) -> Rigid3:
     world_from_gl = frame.transform_matrix
     metric = Rigid3(world_from_gl.rotation, world_from_gl.translation / scale)
@@ -119,6 +178,8 @@ def _pose(frame: _Frame, scale: float) -> Rigid3:
 
 
 def _camera(data: dict[str, Any], where: str) -> Camera:
+    if "fl_x" not in data:
+        raise CalibrationError(f"{where}: neither fl_x nor camera_angle_x; give --camera")
     lens = decode_json(data, _Lens, CalibrationError, where)
     w, h, k1, k2, k3, k4 = int(lens.w), int(lens.h), lens.k1, lens.k2, lens.k3, lens.k4
     p1, p2, fl_y = lens.p1, lens.p2, lens.fl_x if lens.fl_y is None else lens.fl_y
@@ -153,8 +214,11 @@ def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> D
 
 
 def _with_suffix(folder: Path, name: str) -> str:
-    """Add the suffix .png, which Blender's scenes omit."""
-    return name if PurePath(name).suffix or os.path.exists(folder / name) else f"{name}.png"
+    """Add the suffix of the file, which Blender's scenes omit."""
+    for suffix in _SUFFIXES:
+        if os.path.exists(find_path(folder / f"{name}{suffix}")):
+            return f"{name}{suffix}"
+    return name if PurePath(name).suffix else f"{name}.png"
 
 
-FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_nerfstudio)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_nerfstudio, ("calibration",))

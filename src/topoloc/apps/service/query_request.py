@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from dataclasses import dataclass, field
 from pathlib import PurePath
@@ -29,6 +30,12 @@ from topoloc.apps.service.request_errors import RequestError
 from topoloc.plugin import EncodedImage, decode_json
 
 _MAX_FIELD_BYTES = 20_000
+# how JPEG, PNG, WebP, TIFF, BMP and HEIC begin in base64, also that of addresses
+_BASE64 = re.compile(rb"data:image/|[/_]9j[/_]|iVBORw0KGg|UklGR|SUkq|TU0AK|Qk[0-3]|AAAA..Z0eX")
+_REMEDY = (
+    "send the bytes of the image file, not base64: as the body (Content-Type: image/...), or as the"
+    " file `image` of a form (with a filename)"
+)
 _MAX_MS = 600_000.0
 _MAX_MS_FAULT = f"max_ms: above 0 and at most {_MAX_MS:g} milliseconds"
 
@@ -72,11 +79,21 @@ async def read_query_request(request: Request, parameters: QueryParameters) -> Q
     name = fields.get("name", name)[:200]
     if not data:
         raise RequestError(400, f"{name}: the image is empty")
+    if kind := _find_text_kind(data):
+        raise RequestError(415, f"{name}: {kind}, not an image; {_REMEDY}")
     return QueryRequest(
         EncodedImage(name, data, PurePath(name).suffix),
         fields.get("camera"),
         *_parse_parameters(fields),
     )
+
+
+def _find_text_kind(data: bytes) -> str | None:
+    """Return JSON or base64 if the body is one of these, else None. No image file begins so."""
+    start = data[:200].lstrip(b" \t\r\n\"'")
+    if start.startswith((b"{", b"[")):
+        return "JSON"
+    return "base64" if _BASE64.match(start) else None
 
 
 async def read_body(request: Request) -> bytes:
@@ -101,6 +118,8 @@ async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
         form = await parser.parse()
     except (MultiPartException, KeyError, UnicodeDecodeError) as error:
         reason = getattr(error, "message", None) or "it is malformed"
+        if "exceeded maximum size" in reason:
+            reason = f"a field of text has more than {_MAX_FIELD_BYTES} bytes; {_REMEDY}"
         raise RequestError(400, f"the form cannot be read: {reason}") from None
     except ClientDisconnect:
         raise RequestError(400, "the request ended early") from None
@@ -112,6 +131,8 @@ async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
     picture = form.get("image")
     if isinstance(picture, UploadFile):
         return await picture.read(), picture.filename or "image", fields
+    if isinstance(picture, str):
+        raise RequestError(400, f"the field `image` of the form is text; {_REMEDY}")
     raise RequestError(400, "the form has no file called `image`, or ends before it is complete")
 
 

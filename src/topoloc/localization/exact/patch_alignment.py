@@ -112,10 +112,7 @@ class NodeTemplate:
         return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None, colours)
 
 
-_BRIGHTNESS_AND_COLOURS: Float[np.ndarray, "3 3"] = np.array(
-    [[1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0], [1.0, -1.0, 0.0], [-0.5, -0.5, 1.0]]
-)
-"""The mean of red, green and blue, red less green, and blue less yellow."""
+_COLOURS = np.array([[1.0, 1.0, 1.0], [3.0, -3.0, 0.0], [-1.5, -1.5, 3.0]]) / 3.0
 
 
 def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
@@ -126,7 +123,7 @@ def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
     size = 80, max(1, round(80 * image.shape[0] / image.shape[1]))
     darkest = 8.0  # levels below are noise
     levels = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA) + np.float32(darkest))
-    return cv2.transform(levels, _BRIGHTNESS_AND_COLOURS)
+    return cv2.transform(levels, _COLOURS)
 
 
 def sample_colours(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -104,9 +105,10 @@ class Edit:
 
 def today() -> str:
     """Return the day (ISO, UTC). SOURCE_DATE_EPOCH (seconds) replaces the current time if set, for
-    byte-identical builds."""
-    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
-    now = datetime.fromtimestamp(int(epoch), UTC) if epoch.isdigit() else datetime.now(UTC)
+    byte-identical builds. One that is no time counts as not set."""
+    now = datetime.now(UTC)
+    with suppress(ValueError, OverflowError, OSError):
+        now = datetime.fromtimestamp(int(os.environ.get("SOURCE_DATE_EPOCH", "")), UTC)
     return now.date().isoformat()
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from topoloc import MissingExtraError, RecordingError
+from topoloc.apps.formats.bags.bag_clock import Clock
 from topoloc.plugin import natural_key
 
 BAG_SUFFIXES = (".bag", ".bag.active", ".db3")
@@ -47,6 +48,11 @@ class MessageRef(NamedTuple):
     chunk: int
     offset: int
     file: int = 0
+
+    @property
+    def place(self) -> tuple[int, int, int]:
+        """Its place in the order of writing."""
+        return self.file, self.chunk, self.offset
 
 
 @runtime_checkable
@@ -86,12 +92,13 @@ def damaged_message_error(name: str, ref: MessageRef) -> RecordingError:
 @dataclass(eq=False)
 class Bag:
     """Hold the open files of a recording. `notes` are for the user, such as a file that is cut
-    off."""
+    off. `clock` is that of the header times."""
 
     path: Path
     files: list[MessageFile]
     topics: dict[str, Topic] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    clock: Clock = field(default_factory=Clock)
 
     def __post_init__(self) -> None:
         for file in self.files:
@@ -129,7 +136,7 @@ class Bag:
         `most` bytes, and the number of damaged ones. They are read in the order of the file, which
         decompresses a chunk once, and returned in the order in which they were written."""
         parsed, num_damaged = list[tuple[MessageRef, T]](), 0
-        for ref in sorted(self.messages(topic), key=lambda ref: (ref.file, ref.chunk, ref.offset)):
+        for ref in sorted(self.messages(topic), key=lambda ref: ref.place):
             try:
                 parsed.append((ref, parse(self.topics[topic], self.read(ref, most))))
             except RecordingError:

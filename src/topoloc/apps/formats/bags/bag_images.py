@@ -48,23 +48,27 @@ _COMPRESSED_DEPTH = struct.Struct("<iff")
 _RVL_SIZE = struct.Struct("<II")
 
 
-def image_file(message: Any, name: str) -> EncodedImage | None:
+def image_file(message: Any, name: str, is_reversed: bool = False) -> EncodedImage | None:
     """Return the image of a message as a file, if it is compressed or has 16 bits, else None.
-    Raises UnreadableImageError."""
+    `is_reversed` is that of `decode_pixels`. Raises UnreadableImageError."""
     if not hasattr(message, "encoding"):
         return EncodedImage(name, _message_bytes(message, name))
     if str(message.encoding) not in ("mono16", "16UC1"):
         return None
-    return EncodedImage(name, cv2.imencode(".pgm", _decode_pixels(message, name)[0])[1].tobytes())
+    pixels, _ = decode_pixels(message, name, is_reversed)
+    return EncodedImage(name, cv2.imencode(".pgm", pixels)[1].tobytes())
 
 
-def decode_image(message: Any, name: str, white: Callable[[], int] | None = None) -> Image:
+def decode_image(
+    message: Any, name: str, white: Callable[[], int] | None = None, is_reversed: bool = False
+) -> Image:
     """Return the image of a message, grey (H, W) or RGB (H, W, 3), uint8. `white` returns that of
-    `read_image`, and is not called for raw images of 8 bits. Raises UnreadableImageError: damaged,
-    of an encoding that is no picture, or of more than 100 megapixels."""
-    if file := image_file(message, name):
+    `read_image`, and is not called for raw images of 8 bits. `is_reversed` is that of
+    `decode_pixels`. Raises UnreadableImageError: damaged, of an encoding that is no picture, or of
+    more than 100 megapixels."""
+    if file := image_file(message, name, is_reversed):
         return read_image(file, white=white and white())
-    pixels, to_rgb = _decode_pixels(message, name)
+    pixels, to_rgb = decode_pixels(message, name, is_reversed)
     if pixels.dtype == np.float32:
         raise UnreadableImageError(f"{name}: pixels of encoding 32FC1 are depth, not a picture")
     if to_rgb is None:
@@ -78,13 +82,13 @@ def decode_image(message: Any, name: str, white: Callable[[], int] | None = None
         ) from None
 
 
-def decode_depth(message: Any, name: str) -> Float32[np.ndarray, "h w"]:
+def decode_depth(message: Any, name: str, is_reversed: bool = False) -> Float32[np.ndarray, "h w"]:
     """Return the depth of a message in metres, NaN if unknown. It is 16UC1 in millimetres or 32FC1
-    in metres (REP 118), raw or compressedDepth. Raises UnreadableImageError: damaged, or of another
-    encoding."""
+    in metres (REP 118), raw or compressedDepth. `is_reversed` is that of `decode_pixels`. Raises
+    UnreadableImageError: damaged, or of another encoding."""
     if not hasattr(message, "encoding"):
         return _decode_compressed_depth(message, name)
-    pixels, _ = _decode_pixels(message, name)
+    pixels, _ = decode_pixels(message, name, is_reversed)
     if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32):
         raise UnreadableImageError(
             f"{name}: depth must be 16UC1 (mm) or 32FC1 (m), not {message.encoding}"
@@ -169,8 +173,11 @@ def _message_bytes(message: Any, name: str) -> bytes:
         raise UnreadableImageError(f"{name}: the data of this picture are no bytes") from None
 
 
-def _decode_pixels(message: Any, name: str) -> tuple[np.ndarray, int | None]:
-    """Return the stored pixels without the padding of rows."""
+def decode_pixels(
+    message: Any, name: str, is_reversed: bool = False
+) -> tuple[np.ndarray, int | None]:
+    """Return the stored pixels without the padding of rows, and OpenCV's conversion to RGB. With
+    `is_reversed`, the bytes of each pixel come in the other order than the message says."""
     encoding = str(message.encoding)
     if encoding not in _ENCODINGS:
         raise UnreadableImageError(
@@ -186,6 +193,8 @@ def _decode_pixels(message: Any, name: str) -> tuple[np.ndarray, int | None]:
             f"{name}: {len(data)} bytes are no {width}x{height} pixels of {encoding}"
         )
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :row]
+    if is_reversed:
+        rows = rows.reshape(height, width, -1)[..., ::-1].reshape(height, row)
     pixels = np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="), copy=False)
     return pixels if channels == 1 else pixels.reshape(height, width, channels), to_rgb
 

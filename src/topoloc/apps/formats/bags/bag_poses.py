@@ -5,8 +5,10 @@ In the tree of TF each frame has one parent, and is static or moves in it.
 
 from __future__ import annotations
 
+import bisect
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,6 +19,12 @@ from topoloc.apps.formats.bags.bag import Bag
 from topoloc.apps.formats.bags.messages import TRANSFORM_TYPES, StampedTransform, decode_transforms
 from topoloc.apps.formats.bags.topics import TF, Roles
 from topoloc.plugin import read_ground_truth
+
+_MAX_GAP_S = 0.2
+# A correction changes slowly, but for a relocalization.
+_MAX_CORRECTION_GAP_S, _MAX_CORRECTION_M, _MAX_CORRECTION_RAD = 10.0, 0.5, math.radians(10.0)
+_TOLERANCE = 1e-6  # metres, and radians
+_MAX_MISSING_SHARE = 0.1
 
 
 def trajectory_from_transforms(transforms: list[StampedTransform]) -> Trajectory:
@@ -35,17 +43,20 @@ def pose_of_transform(its: StampedTransform) -> Rigid3:
 
 @dataclass(eq=False)
 class TransformTree:
-    """Hold the transforms of each frame in its parent. Those of `static_frames` hold for all
-    times."""
+    """Hold the transforms of each frame in its parent. Those of `static_frames`, and those that are
+    sent again and again with the same numbers, hold for all times."""
 
     transforms: dict[str, list[StampedTransform]] = field(default_factory=dict)
     static_frames: set[str] = field(default_factory=set)
+    _changed_frames: set[str] = field(default_factory=set)
 
     def add(self, its: StampedTransform, is_static: bool) -> None:
         """Add a transform. If a frame has several parents, the first one is used."""
         known = self.transforms.setdefault(its.child, [])
         if its.child and not (known and known[0].parent != its.parent):
             known.append(its)
+            if not _is_same(known[0], its):
+                self._changed_frames.add(its.child)
             if is_static:
                 self.static_frames.add(its.child)
 
@@ -57,13 +68,24 @@ class TransformTree:
         """Return world_from_frame at each time, with the root as world. None if a transform is
         unknown at that time. Raises TrajectoryError: a quaternion without length."""
         poses: list[Rigid3 | None] = [Rigid3.identity()] * len(t_ns)
-        for child, _ in self._edges_to_root(frame):
-            steps = self._poses_at(child, t_ns)
+        edges = [child for child, _ in self._edges_to_root(frame)]
+        carrier = max(edges, key=self._path_length, default="")
+        for row, child in enumerate(edges):
+            steps = self._poses_at(child, t_ns, row > edges.index(carrier))
             poses = [
                 step @ pose if step is not None and pose is not None else None
                 for step, pose in zip(steps, poses, strict=True)
             ]
         return poses
+
+    def describe_slow_edge(self, frame: str) -> str | None:
+        """Return the first transform above a frame that comes too rarely, with its period."""
+        for child, parent in self._edges_to_root(frame):
+            if not self._is_static(child):
+                gap = _median_gap_s(self.transforms[child])
+                if gap > _MAX_GAP_S:
+                    return f"TF from {parent} to {child} comes once in {gap:.2g} s"
+        return None
 
     def find_static_transform(self, target: str, source: str) -> Rigid3 | None:
         """Return to_from_of if both are static in a common frame, else None."""
@@ -104,13 +126,78 @@ class TransformTree:
             frame = parent
 
     def _is_static(self, frame: str) -> bool:
-        return frame in self.static_frames or len(self.transforms[frame]) == 1
+        return frame in self.static_frames or frame not in self._changed_frames
 
-    def _poses_at(self, child: str, t_ns: Sequence[int]) -> Sequence[Rigid3 | None]:
-        """Return parent_from_child at each time."""
+    def _path_length(self, frame: str) -> float:
+        """Return how far a frame moves and turns in its parent (metres plus radians)."""
+        if self._is_static(frame):
+            return 0.0
+        steps = pairwise(self.transforms[frame])
+        return sum(math.dist(a.translation, b.translation) + _angle(a, b) for a, b in steps)
+
+    def _poses_at(
+        self, child: str, t_ns: Sequence[int], is_correction: bool
+    ) -> Sequence[Rigid3 | None]:
+        """Return parent_from_child at each time. A correction, such as that of odometry in a map,
+        may come rarely."""
         if self._is_static(child):
             return [pose_of_transform(self.transforms[child][-1])] * len(t_ns)
-        return trajectory_from_transforms(self.transforms[child]).interpolate(t_ns)
+        trajectory = trajectory_from_transforms(self.transforms[child])
+        if is_correction:
+            return _interpolate_correction(trajectory, t_ns)
+        return trajectory.interpolate(t_ns, _MAX_GAP_S)
+
+
+def _interpolate_correction(trajectory: Trajectory, t_ns: Sequence[int]) -> list[Rigid3 | None]:
+    """Return the pose at each time. Neighbours may be some seconds apart, unless they differ as
+    after a relocalization. The first and the last one hold as long before and after."""
+    times, poses = trajectory.t_ns or [], trajectory.world_from_cam
+    clipped = [min(max(time, times[0]), times[-1]) for time in t_ns]
+    found = trajectory.interpolate(clipped, _MAX_CORRECTION_GAP_S)
+    for row, (time, near) in enumerate(zip(t_ns, clipped, strict=True)):
+        after = bisect.bisect_left(times, near)
+        is_jump = times[after] - near > 0 and times[after] - times[after - 1] > _MAX_GAP_S * 1e9
+        if is_jump:
+            change = poses[after - 1].inverse() @ poses[after]
+            moved, turned = float(np.linalg.norm(change.translation)), change.angle()
+            is_jump = moved > _MAX_CORRECTION_M or turned > _MAX_CORRECTION_RAD
+        if is_jump or abs(time - near) > _MAX_CORRECTION_GAP_S * 1e9:
+            found[row] = None
+    return found
+
+
+def _is_same(a: StampedTransform, b: StampedTransform) -> bool:
+    return math.dist(a.translation, b.translation) <= _TOLERANCE and _angle(a, b) <= _TOLERANCE
+
+
+def _angle(a: StampedTransform, b: StampedTransform) -> float:
+    """Return about the angle between two rotations, if it is small. q and -q are the same one."""
+    opposite = tuple(-number for number in b.quat_xyzw)
+    return 2.0 * min(math.dist(a.quat_xyzw, b.quat_xyzw), math.dist(a.quat_xyzw, opposite))
+
+
+def _median_gap_s(transforms: list[StampedTransform]) -> float:
+    times = np.unique([its.t_ns for its in transforms])
+    return float(np.median(np.diff(times))) / 1e9 if len(times) > 1 else 0.0
+
+
+def _read_transforms(bag: Bag, name: str) -> tuple[list[StampedTransform], int]:
+    """Return the transforms of a topic and the number of damaged messages. If those of a frame all
+    have one time, they get the times of writing."""
+    parsed, num_damaged = bag.parse_messages(name, decode_transforms)
+    times: dict[str, list[int]] = {}
+    for its in (its for _, some in parsed for its in some):
+        times.setdefault(its.child, []).append(its.t_ns)
+    timeless = {
+        child for child, stamps in times.items() if len(stamps) > 2 and len(set(stamps)) == 1
+    }
+    timed = list[StampedTransform]()
+    for ref, some in parsed:
+        for its in some:
+            is_timeless = its.child in timeless
+            t_ns = ref.log_t_ns if is_timeless else bag.clock.unwrap(ref.place, its.t_ns)
+            timed.append(its if t_ns == its.t_ns else replace(its, t_ns=t_ns))
+    return timed, num_damaged
 
 
 def read_transform_tree(bag: Bag) -> TransformTree:
@@ -118,8 +205,8 @@ def read_transform_tree(bag: Bag) -> TransformTree:
     notes."""
     tree, total = TransformTree(), 0
     for name in [name for name, topic in bag.topics.items() if topic.type in TRANSFORM_TYPES]:
-        parsed, num_damaged = bag.parse_messages(name, decode_transforms)
-        for its in (its for _, transforms in parsed for its in transforms):
+        transforms, num_damaged = _read_transforms(bag, name)
+        for its in transforms:
             tree.add(its, is_static=name.endswith("static"))
         total += num_damaged
     bag.note_damaged(total, "transforms")
@@ -140,9 +227,17 @@ def camera_poses(
         if source == TF:
             frame = roles.pose_frame or camera_frame
             poses = tree.poses(frame, t_ns) if tree.is_moving(frame) else []
+            slow = tree.describe_slow_edge(frame)
         else:
-            poses = _poses_from_topic(bag, source, roles.pose_frame, camera_frame, tree, t_ns)
-        if any(pose is not None for pose in poses):
+            poses, slow = _poses_from_topic(bag, source, roles, camera_frame, tree, t_ns)
+        num_missing = sum(pose is None for pose in poses)
+        if num_missing < len(poses):
+            if slow and num_missing > _MAX_MISSING_SHARE * len(poses):
+                bag.notes.append(
+                    f"{bag.path}: {slow}, but poses are interpolated over {_MAX_GAP_S} s at most:"
+                    f" {num_missing} of {len(poses)} pictures have none; choose another topic"
+                    " (--topics pose=TOPIC) or compute the poses (--trajectory slam)"
+                )
             return poses
         del bag.notes[num_notes:]
     message = (
@@ -156,15 +251,15 @@ def camera_poses(
 
 
 def _poses_from_topic(
-    bag: Bag, name: str, frame: str | None, camera_frame: str, tree: TransformTree, t_ns: list[int]
-) -> list[Rigid3 | None]:
-    """Return camera poses from a topic with the poses of `frame`, or else of the frame that its
-    messages name."""
-    parsed, num_damaged = bag.parse_messages(name, decode_transforms)
+    bag: Bag, name: str, roles: Roles, camera_frame: str, tree: TransformTree, t_ns: list[int]
+) -> tuple[list[Rigid3 | None], str | None]:
+    """Return camera poses from a topic with the poses of the roles' frame, or else of the frame
+    that its messages name. The second value says so if they come too rarely."""
+    frame = roles.pose_frame
+    transforms, num_damaged = _read_transforms(bag, name)
     bag.note_damaged(num_damaged, name)
-    transforms = [its for _, some in parsed for its in some]
     if not transforms:
-        return [None] * len(t_ns)
+        return [None] * len(t_ns), None
     body = frame or transforms[0].child
     body_from_cam = tree.find_static_transform(body, camera_frame) if body else None
     if body_from_cam is None:
@@ -177,5 +272,7 @@ def _poses_from_topic(
         why = "it does not say whose they are (pose_frame=FRAME would)"
         why = f"no fixed transform from {camera_frame} to {body}" if body else why
         bag.notes.append(f"{bag.path}: poses of {name} are taken for the camera's: {why}")
-    world_from_bodies = trajectory_from_transforms(transforms).interpolate(t_ns)
-    return [pose @ body_from_cam if pose is not None else None for pose in world_from_bodies]
+    gap = _median_gap_s(transforms)
+    slow = f"poses of {name} come once in {gap:.2g} s" if gap > _MAX_GAP_S else None
+    world_from_bodies = trajectory_from_transforms(transforms).interpolate(t_ns, _MAX_GAP_S)
+    return [pose and pose @ body_from_cam for pose in world_from_bodies], slow

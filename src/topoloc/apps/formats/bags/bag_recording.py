@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +38,11 @@ from topoloc.apps.formats.bags.bag_calibration import (
     find_rig,
     read_camera_info,
 )
+from topoloc.apps.formats.bags.bag_clock import Clock
 from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image, image_file
 from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
 from topoloc.apps.formats.bags.messages import decode, frame_id, header_stamp_ns, num_header_bytes
+from topoloc.apps.formats.bags.pixel_order import has_reversed_bytes
 from topoloc.apps.formats.bags.topics import Roles, is_registered, parse_topics, select_topics
 from topoloc.plugin import (
     CameraCalibration,
@@ -55,10 +58,13 @@ MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
 
 @dataclass(frozen=True, eq=False)
 class ImageMessages:
-    """Hold the messages of a topic of images, one for each frame."""
+    """Hold the messages of a topic of images, one for each frame. `is_reversed`: their pixels have
+    the other order of bytes than they say."""
 
     topic: Topic
     refs: list[MessageRef]
+    is_stamped: bool = True
+    is_reversed: bool = False
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -93,7 +99,8 @@ class BagRecording(IndexedFrames):
     def _sample_files(self) -> Iterator[EncodedImage]:
         for row in range(0, len(self), max(1, len(self) // 5)):
             with suppress(UnreadableImageError):
-                if (file := image_file(*self._read_message(self.left, row))) is None:
+                message, name = self._read_message(self.left, row)
+                if (file := image_file(message, name, self.left.is_reversed)) is None:
                     return
                 yield file
 
@@ -114,7 +121,7 @@ class BagRecording(IndexedFrames):
         if self.depth is not None:
             images, camera, cam_from_depth = self.depth
             message, name = self._read_message(images, row)
-            depth = decode_depth(message, name)
+            depth = decode_depth(message, name, images.is_reversed)
             if camera == self.camera:  # registered, and may be coarser
                 return replace(frame, depth=depth_image_of(name, depth, camera, cam_from_depth))
             _check_size(name, depth.shape, camera)
@@ -130,7 +137,7 @@ class BagRecording(IndexedFrames):
 
     def _read_image(self, images: ImageMessages, index: int, camera: Camera | None) -> Image:
         message, name = self._read_message(images, index)
-        image = decode_image(message, name, lambda: self._white_level)
+        image = decode_image(message, name, lambda: self._white_level, images.is_reversed)
         if camera is not None:
             _check_size(name, image.shape, camera)
         return image
@@ -172,7 +179,7 @@ def open_bag(
 
 
 def _open_recording(bag: Bag, roles: Roles, given: CameraCalibration | None) -> BagRecording:
-    t_ns, left = _index_by_time(bag, roles.left)
+    t_ns, left = _index_by_time(bag, roles.left, is_first=True)
     tree, info = read_transform_tree(bag), read_camera_info(bag, roles.left_info, roles.left)
     frame = (info.frame if info is not None else "") or _read_frame_id(bag, left)
     camera = find_left_camera(bag, roles, info, given)
@@ -195,35 +202,74 @@ def _open_recording(bag: Bag, roles: Roles, given: CameraCalibration | None) -> 
     return BagRecording(bag.path.resolve().name, bag, t_ns, poses, camera, left, right, depth)
 
 
-def _index_by_time(bag: Bag, name: str) -> tuple[list[int], ImageMessages]:
+def _index_by_time(bag: Bag, name: str, is_first: bool = False) -> tuple[list[int], ImageMessages]:
     """Return the messages of a topic sorted by their own times. Damaged ones are skipped with a
-    note."""
+    note. The first topic tells whether the clock was set back."""
     topic = bag.topics[name]
     stamped, num_damaged = bag.parse_messages(name, header_stamp_ns, num_header_bytes(topic))
     bag.note_damaged(num_damaged, name)
-    # a driver that sets no times writes 0 into each
-    is_stamped = sum(not stamp for _, stamp in stamped) <= 1
-    by_time = {
-        stamp if is_stamped and stamp is not None else ref.log_t_ns: ref for ref, stamp in stamped
-    }
-    if not by_time:
+    if not stamped:
         raise RecordingError(f"{bag.path}: no whole message of {name}")
+    if is_first:
+        known = [(ref.place, t_ns, ref.log_t_ns) for ref, t_ns in stamped if t_ns is not None]
+        bag.clock = Clock.of_times(known)
+        if bag.clock.starts:
+            bag.notes.append(f"{bag.path}: {bag.clock.describe(name)}")
+    times = [None if t is None else bag.clock.unwrap(ref.place, t) for ref, t in stamped]
+    # a driver that sets no times writes 0, or one time, into each
+    is_stamped = sum(not time for time in times) <= 1 and 2 * len(set(times)) >= len(times)
+    if not is_stamped:
+        bag.notes.append(
+            f"{bag.path}: the header times of {name} are 0 or the same: the times of writing are"
+            " used"
+        )
+    timed = [
+        (ref, time if is_stamped and time is not None else ref.log_t_ns)
+        for (ref, _), time in zip(stamped, times, strict=True)
+    ]
+    by_time = {time: ref for ref, time in timed}
+    _note_same_times(bag, name, [(ref, by_time[t]) for ref, t in timed if by_time[t] != ref])
     t_ns = sorted(by_time)
-    return t_ns, ImageMessages(topic, [by_time[time] for time in t_ns])
+    refs = [by_time[time] for time in t_ns]
+    is_reversed = has_reversed_bytes(bag, topic, refs)
+    return t_ns, ImageMessages(topic, refs, is_stamped, is_reversed)
+
+
+def _note_same_times(bag: Bag, name: str, pairs: list[tuple[MessageRef, MessageRef]]) -> None:
+    """Note the number of messages that are left out because another one has their time. A message
+    that was recorded twice is none of them."""
+    for ref, other in pairs[:5]:
+        with suppress(RecordingError):
+            if bag.read(ref) != bag.read(other):
+                bag.notes.append(
+                    f"{bag.path}: {len(pairs)} pictures of {name} have the time of another one and"
+                    " are left out"
+                )
+                return
 
 
 def _match_by_time(
     bag: Bag, first: tuple[list[int], ImageMessages], name: str, delay_ms: int
 ) -> tuple[list[int], ImageMessages, ImageMessages]:
     """Return the times and images that have a partner on the topic `name` within `delay_ms`, and
-    the partners."""
+    the partners. If one topic has no header times, the times of writing are compared."""
     t_ns, left = first
     others, images = _index_by_time(bag, name)
-    pairs, notes = match_times(t_ns, others, delay_ms, str(bag.path), (left.topic.name, name))
+    times = t_ns
+    if not (left.is_stamped and images.is_stamped):
+        images = replace(images, refs=sorted(images.refs))
+        times, others = ([ref.log_t_ns for ref in its.refs] for its in (left, images))
+        delay_ms = max(delay_ms, _quarter_period_ms(others))  # they are written when they arrive
+    pairs, notes = match_times(times, others, delay_ms, str(bag.path), (left.topic.name, name))
     bag.notes += notes
-    refs, partners = [left.refs[row] for row, _ in pairs], [images.refs[row] for _, row in pairs]
-    matched = ImageMessages(left.topic, refs), ImageMessages(images.topic, partners)
-    return [t_ns[row] for row, _ in pairs], *matched
+    matched = replace(left, refs=[left.refs[row] for row, _ in pairs])
+    partners = replace(images, refs=[images.refs[row] for _, row in pairs])
+    return [t_ns[row] for row, _ in pairs], matched, partners
+
+
+def _quarter_period_ms(t_ns: list[int]) -> int:
+    steps = sorted(after - before for before, after in pairwise(t_ns))
+    return steps[len(steps) // 2] // 4_000_000 if steps else 0
 
 
 def _read_frame_id(bag: Bag, images: ImageMessages) -> str:
