@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from topoloc.errors import TrajectoryError
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.pose_conventions import PoseConventions
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.recordings.frame import SequenceView, StereoFrame
+from topoloc.recordings.frame import (
+    MemorySequence,
+    SequenceView,
+    StereoFrame,
+    StereoSequence,
+)
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import with_poses
 from topoloc.slam.input_checks import check_pose_coverage
@@ -184,6 +190,47 @@ def test_a_recording_of_single_images_is_checked_too(tiny_recording: Path):
     inverse = [pose.inverse() for pose in sequence.poses if pose is not None]
     with pytest.raises(TrajectoryError, match="--poses inverse"):
         check_poses(LeftPicturesAlone(sequence, rows, list(inverse)))
+
+
+def named_recording(names: list[str], poses: list[Rigid3]) -> MemorySequence:
+    image, camera = np.zeros((24, 32), np.uint8), Camera.pinhole(32, 24, 40.0, 40.0, 15.5, 11.5)
+    frames = zip(names, T_NS, poses, strict=False)
+    return MemorySequence(
+        [StereoFrame(name, t, image, camera, world_from_cam=pose) for name, t, pose in frames]
+    )
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the steps be those of `POSES`."""
+
+    def measure(sequence: StereoSequence, _: list[int]) -> list[MeasuredStep]:
+        steps = steps_of(POSES, 0)
+        frames = {int(name.split("_")[1]): k for k, name in enumerate(sequence.names)}
+        return [
+            replace(step, first=frames[step.first], last=frames[step.last])
+            for step in steps
+            if {step.first, step.last} <= frames.keys()
+        ]
+
+    monkeypatch.setattr("topoloc.slam.pose_checks.measure_steps", measure)
+    monkeypatch.setattr("topoloc.slam.pose_checks.check_calibration", lambda *_: None)
+
+
+@pytest.mark.usefixtures("measured")
+@pytest.mark.parametrize("num_frames", [60, 85, 120])
+@pytest.mark.parametrize("pattern", ["left/im_{}_.png", "im_{:02d}_x.jpg"])
+@pytest.mark.parametrize("first", [0, 5])
+def test_rows_in_the_order_of_names_as_text(num_frames: int, pattern: str, first: int):
+    """Of a whole recording, and of a part of it. Rows in the right order pass."""
+    names = [pattern.format(number) for number in range(num_frames)]
+    rows = [pose for _, pose in sorted(zip(names, POSES, strict=False), key=lambda pair: pair[0])]
+    check_poses(named_recording(names, POSES)[first:])
+    if names == sorted(names):
+        check_poses(named_recording(names, rows)[first:])
+        return
+    with pytest.raises(TrajectoryError, match=r"sorted as text \(im_0+_.*: sort the rows"):
+        check_poses(named_recording(names, rows)[first:])
 
 
 def test_gaps_of_more_than_half(tiny_recording: Path):

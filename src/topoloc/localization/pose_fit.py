@@ -10,10 +10,10 @@ from jaxtyping import Float, Float32, Int
 
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
-from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.camera import Camera, UncalibratedCamera, nominal_camera
 from topoloc.geometry.pose_matches import MIN_POINTS
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.squeezed_image import estimate_pose_and_camera
 from topoloc.mapping.topomap import TopoNode
 from topoloc.node_ids import NodeId
 
@@ -217,7 +217,7 @@ def fit_pose(
     points_world = local_map.points_world[matches.train_idx]
     covariances = local_map.covariances[matches.train_idx]
     if isinstance(input_camera, UncalibratedCamera):
-        found = estimate_pose_and_focal(
+        found = estimate_pose_and_camera(
             points_img,
             points_world,
             input_camera,

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 
 from topoloc.disk_list import bytes_of
+from topoloc.mapping.forks import fork_safe
 from topoloc.node_ids import Row
 
 T = TypeVar("T")
@@ -22,7 +23,7 @@ class NodeCache:
     Thread-safe."""
 
     def __init__(self, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
-        self._lock = threading.Lock()
+        self._lock = fork_safe(threading.Lock())
         self._removed_owners: list[int] = []
         self._entries: OrderedDict[tuple[int, Row], tuple[Any, int]] = OrderedDict()
         self._max_bytes, self._num_bytes = max_bytes, 0
@@ -90,7 +91,7 @@ class CachedNodes(Generic[T]):
     """Call `read` for a row of a map, or return its cached value."""
 
     _next_owner = 0
-    _owner_lock = threading.Lock()
+    _owner_lock = fork_safe(threading.Lock())
 
     def __init__(self, read: Callable[[Row], T], cache: NodeCache = NODE_CACHE) -> None:
         with CachedNodes._owner_lock:

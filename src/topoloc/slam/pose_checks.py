@@ -16,6 +16,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 
 import numpy as np
 from jaxtyping import Float
@@ -32,7 +33,7 @@ from topoloc.geometry.pose_conventions import (
     describe_conventions,
 )
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.recordings.trajectory import Trajectory
 from topoloc.slam.calibration_checks import check_calibration
 from topoloc.slam.input_checks import add_calibration
@@ -113,6 +114,7 @@ def check_poses(sequence: StereoSequence) -> None:
         return
     steps = measure_steps(sequence, posed)
     verdict = evaluate_poses(steps, sequence.poses, sequence.t_ns)
+    _check_order(sequence, steps, verdict)
     check_calibration(sequence, steps, verdict.is_accepted)
     if verdict.is_accepted:
         return
@@ -135,13 +137,7 @@ def evaluate_poses(
     steps: Sequence[MeasuredStep], poses: Sequence[Rigid3 | None], t_ns: Sequence[int]
 ) -> PoseCheckResult:
     """Compare the poses (world_from_cam in metres, one for each frame) with the measured steps."""
-    measured: list[MeasuredStep] = []
-    ends: list[tuple[Rigid3, Rigid3]] = []
-    for step in steps:
-        first, last = poses[step.first], poses[step.last]
-        if first is not None and last is not None and step.decides_on(first.inverse() @ last):
-            measured.append(step)
-            ends.append((first, last))
+    measured, ends = _informative_steps(steps, poses)
     num = len(measured)
     if num < _MIN_INFORMATIVE_STEPS:
         return PoseCheckResult(num, num)
@@ -166,6 +162,48 @@ def evaluate_poses(
         readings = [one for one in readings if one.num_consistent >= min_consistent]
     best = max(readings, key=lambda one: one.sort_key, default=as_is)
     return replace(verdict, conventions=best.conventions)
+
+
+def _check_order(
+    sequence: StereoSequence, steps: Sequence[MeasuredStep], verdict: PoseCheckResult
+) -> None:
+    """Raise TrajectoryError if the poses fit better where their rows are in the order of the names
+    as text (10 before 2). Frames are in the order of the numbers in their names."""
+    base, rows = sequence, list(range(len(sequence)))
+    while isinstance(base, SequenceView) and not base.has_own_poses:
+        base, rows = base.base, [base.indices[row] for row in rows]
+    names = [PurePath(name).name for name in base.names]
+    order = sorted(range(len(names)), key=names.__getitem__)
+    if order == list(range(len(names))):
+        return
+    posed = dict(zip(order, base.poses, strict=True))
+    measured, ends = _informative_steps(steps, [posed[row] for row in rows])
+    if len(measured) < _MIN_INFORMATIVE_STEPS:
+        return
+    fits, num = _interpret((), measured, _compute_steps(ends)).num_consistent, len(measured)
+    is_better = fits > verdict.num_consistent + 1
+    is_better &= fits * verdict.num_informative > verdict.num_consistent * num
+    if is_better and fits >= _MIN_CONVENTION_RATIO * num:
+        as_text, by_number = (", ".join(names[k] for k in one[:4]) for one in (order, range(4)))
+        raise TrajectoryError(
+            f"{sequence.name}: the rows of the poses are in the order of the names sorted as text"
+            f" ({as_text} ...), and the pictures in that of their numbers ({by_number} ...): sort"
+            " the rows like the pictures, by number"
+        )
+
+
+def _informative_steps(
+    steps: Sequence[MeasuredStep], poses: Sequence[Rigid3 | None]
+) -> tuple[list[MeasuredStep], list[tuple[Rigid3, Rigid3]]]:
+    """Return the steps that decide on the poses, and the poses at their two ends."""
+    measured: list[MeasuredStep] = []
+    ends: list[tuple[Rigid3, Rigid3]] = []
+    for step in steps:
+        first, last = poses[step.first], poses[step.last]
+        if first is not None and last is not None and step.decides_on(first.inverse() @ last):
+            measured.append(step)
+            ends.append((first, last))
+    return measured, ends
 
 
 def _compute_steps(ends: _Ends, conventions: tuple[str, ...] = ()) -> list[Rigid3]:

@@ -24,6 +24,7 @@ from topoloc.errors import (
     MapError,
 )
 from topoloc.json_data import Count, decode_json
+from topoloc.mapping.forks import fork_safe
 from topoloc.mapping.storage.schema import (
     SCHEMA_1,
     SORT_COLUMNS,
@@ -83,7 +84,7 @@ class MapFile:
 
     def __init__(self, path: Path, digest: str | None = None) -> None:
         self.path = path
-        self._lock = threading.RLock()
+        self._lock = fork_safe(threading.RLock())
         self._calls_left, self._database = 0, None
         self._counts: dict[str, int] = {}
         self._cache: dict[str, Any] = {}

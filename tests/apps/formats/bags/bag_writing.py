@@ -23,6 +23,7 @@ from topoloc.recordings.frame import StereoFrame, StereoSequence
 
 LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
 FEATURE_TYPES = ("ros1", "ros1-lz4", "ros2", "ros2-mcap", "mcap-zstd")
+SUFFIXES = {"ros1": ".bag", "ros1-lz4": ".bag", "ros2": "", "ros2-mcap": "", "mcap-zstd": ".mcap"}
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS1.register(
     get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")

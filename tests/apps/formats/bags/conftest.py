@@ -6,12 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bag_writing import by_tf, write_stereo_bag
+from bag_writing import SUFFIXES, by_tf, write_stereo_bag
 
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
-
-SUFFIXES = {"ros1": ".bag", "ros1-lz4": ".bag", "ros2": "", "ros2-mcap": "", "mcap-zstd": ".mcap"}
 
 
 @pytest.fixture(scope="session")

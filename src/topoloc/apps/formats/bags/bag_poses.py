@@ -25,6 +25,7 @@ _MAX_GAP_S = 0.2
 _MAX_CORRECTION_GAP_S, _MAX_CORRECTION_M, _MAX_CORRECTION_RAD = 10.0, 0.5, math.radians(10.0)
 _TOLERANCE = 1e-6  # metres, and radians
 _MAX_MISSING_SHARE = 0.1
+_WORLD_FRAMES = ("map", "odom", "world")  # REP 105
 
 
 def trajectory_from_transforms(transforms: list[StampedTransform]) -> Trajectory:
@@ -63,6 +64,14 @@ class TransformTree:
     def is_moving(self, frame: str) -> bool:
         """Return whether a transform between this frame and the root of its tree changes."""
         return any(not self._is_static(below) for below, _ in self._edges_to_root(frame))
+
+    def is_standing(self, frame: str) -> bool:
+        """Return whether transforms up to a world are sent again and again with the same
+        numbers, as by a robot that does not move."""
+        edges = list(self._edges_to_root(frame))
+        sent = [child for child, _ in edges if child not in self.static_frames]
+        is_sent_again = any(len(self.transforms[child]) > 1 for child in sent)
+        return is_sent_again and edges[-1][1] in _WORLD_FRAMES
 
     def poses(self, frame: str, t_ns: Sequence[int]) -> list[Rigid3 | None]:
         """Return world_from_frame at each time, with the root as world. None if a transform is
@@ -222,10 +231,10 @@ def camera_poses(
     if not roles.poses:
         beside = bag.path / "truth.tum" if bag.path.is_dir() else bag.path.with_suffix(".tum")
         return read_ground_truth(Path(beside), [], t_ns)
+    frame = roles.pose_frame or camera_frame
     for source in roles.poses:
         num_notes = len(bag.notes)
         if source == TF:
-            frame = roles.pose_frame or camera_frame
             poses = tree.poses(frame, t_ns) if tree.is_moving(frame) else []
             slow = tree.describe_slow_edge(frame)
         else:
@@ -234,12 +243,14 @@ def camera_poses(
         if num_missing < len(poses):
             if slow and num_missing > _MAX_MISSING_SHARE * len(poses):
                 bag.notes.append(
-                    f"{bag.path}: {slow}, but poses are interpolated over {_MAX_GAP_S} s at most:"
-                    f" {num_missing} of {len(poses)} pictures have none; choose another topic"
-                    " (--topics pose=TOPIC) or compute the poses (--trajectory slam)"
+                    f"{bag.path}: {slow}, too rarely to interpolate: {num_missing} of {len(poses)}"
+                    " pictures have no pose; choose another topic (--topics pose=TOPIC) or compute"
+                    " the poses (--trajectory slam)"
                 )
             return poses
         del bag.notes[num_notes:]
+    if TF in roles.poses and tree.is_standing(frame):
+        return tree.poses(frame, t_ns)
     message = (
         f"{bag.path}: no pose of {camera_frame or 'the camera'} at the times of the pictures in"
         f" {' or '.join(roles.poses)}"
