@@ -186,6 +186,17 @@ def test_missing_images_at_the_ends_are_ambiguous(recording: Path):
         open_sequence(recording, whole_only=True)
 
 
+@pytest.mark.parametrize(("kind", "bits"), [(np.float32, 32), (np.float64, 64)])
+def test_whole_images_of_floats_are_not_called_damaged(tmp_path: Path, kind: type, bits: int):
+    for number in range(3):
+        write(tmp_path / f"{number}.tiff", (picture(number, 3) / 255.0).astype(kind))
+    with pytest.raises(
+        RecordingError, match=rf"0\.tiff: pixels of {bits}-bit floats; a pict"
+    ) as at:
+        open_sequence(tmp_path, whole_only=True)
+    assert "copy" not in str(at.value)
+
+
 @pytest.mark.parametrize("command", [("evaluate",), ("certify", "--walk")])
 def test_measuring_commands_leave_damaged_frames_out(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]

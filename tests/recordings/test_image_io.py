@@ -17,6 +17,7 @@ from tiny_recordings import picture, write
 from topoloc.errors import UnreadableImageError
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import image_size, read_depth, read_depth_image, read_image
+from topoloc.recordings.open import open_sequence
 
 pytestmark = pytest.mark.usefixtures("quiet")
 
@@ -134,6 +135,7 @@ def test_names_in_another_form_of_unicode_are_found(
     np.save(path.with_suffix(".npy"), np.full((2, 2), 1500.0))
     np.testing.assert_array_equal(read_image(other), read_image(path))
     np.testing.assert_array_equal(read_depth_image(other.with_suffix(".npy"), 1000.0), 1.5)
+    assert open_sequence(f"{other}@0").names == [path.name]
     with pytest.raises(UnreadableImageError, match=r"é_2\.png: no such picture"):
         read_image(tmp_path / "é_2.png")
 

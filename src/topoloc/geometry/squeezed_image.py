@@ -18,10 +18,10 @@ from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
 
-_MIN_INLIERS, _WELL_EXPLAINED = 30, 0.98  # of the matches by square pixels: no ratio is searched
+_MIN_INLIERS, _WELL_EXPLAINED = 12, 0.98  # of the matches by square pixels: no ratio is searched
 _STEPS = (0.09, 0.03, 0.01)  # of the logarithm of the ratio
 _MAX_LOG_RATIO = 0.45
-_MIN_GAIN = 0.93  # of the errors, in the first steps
+_MIN_GAIN = 0.9  # of the errors; those of whole images fall less
 _Found = tuple[AbsolutePose, Camera]
 
 
@@ -65,10 +65,13 @@ class _Matches:
         """Return the pose whose covariance includes a ratio that is off by the last step."""
         pose, camera = found
         other = self.fit(log_ratio + _STEPS[-1], (pose.cam_from_world, camera))
-        if other is None:
+        if other is None or pose.camera is None:
             return found
         shift = (other[0].cam_from_world @ pose.cam_from_world.inverse()).log()
-        return replace(pose, covariance=pose.covariance + np.outer(shift, shift)), camera
+        added = np.outer(shift, shift)
+        weighed = [replace(one, covariance=one.covariance + added) for one in pose.camera.weighed]
+        belief = replace(pose.camera, weighed=weighed)
+        return replace(pose, covariance=pose.covariance + added, camera=belief), camera
 
 
 def estimate_pose_and_camera(
@@ -121,9 +124,9 @@ def _search_ratio(matches: _Matches, whole: _Found) -> tuple[float, _Found | Non
             if now[0] >= cost:
                 break
             direction, (cost, at, best) = now[1] - at, now
-        if step == _STEPS[0] and cost > least:
-            return 0.0, None
-    return at, best
+        if at == 0.0:
+            break
+    return (at, best) if cost < least else (0.0, None)
 
 
 def _unsqueezed(camera: Camera) -> Camera:

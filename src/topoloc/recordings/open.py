@@ -15,6 +15,7 @@ from topoloc.recordings.depth_range import leave_out_stuck_depth
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence, sequence_subset
+from topoloc.recordings.image_files import find_path
 from topoloc.recordings.recording import leave_out_damaged, recording_notes
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
@@ -172,7 +173,10 @@ def split_selection(path: str) -> tuple[Path, str | None]:
     """Split a path into the recording's folder or file and the selection after an @. The selection
     is None if there is none."""
     folder, at, selection = path.rpartition("@")
-    return (Path(path), None) if not at or os.path.exists(path) else (Path(folder), selection)
+    whole = find_path(Path(path))
+    return (
+        (whole, None) if not at or os.path.exists(whole) else (find_path(Path(folder)), selection)
+    )
 
 
 def parse_selection(text: str, num_frames: int) -> list[int]:

@@ -255,13 +255,15 @@ def leave_out_damaged(
     paths_of: Callable[[int], list[Path]] | None = getattr(base, "paths_of", None)
     if paths_of is None:
         return sequence
-    damaged = [next(filter(_is_damaged, paths_of(row)), None) for row in rows]
-    whole = [k for k, path in enumerate(damaged) if path is None]
+    damaged = [next(filter(None, map(_find_damage, paths_of(row))), None) for row in rows]
+    whole = [k for k, damage in enumerate(damaged) if damage is None]
     if len(whole) == len(rows):
         return sequence
-    first = next(path for path in damaged if path is not None)
+    first = next(damage for damage in damaged if damage is not None)
     num = f"{sequence.name}: {len(rows) - len(whole)} of {len(rows)} frames"
     if 2 * len(whole) < len(rows):
+        if ": pixels of" in first:
+            raise RecordingError(f"{num} have an image that is not read (first: {first})")
         raise RecordingError(
             f"{num} have a missing or damaged image (first: {first}); copy the recording again"
         )
@@ -270,22 +272,25 @@ def leave_out_damaged(
     return sequence_subset(sequence, whole)
 
 
-def _is_damaged(path: Path) -> bool:
-    """Return whether an image or depth image is missing, empty or truncated. PNG and JPEG that end
-    as their format does are not decoded. The end of a thumbnail may stand before it."""
+def _find_damage(path: Path) -> str | None:
+    """Return the path of an image or depth image that is missing, empty or truncated, or the reason
+    if its pixels are not read. None if it is whole. PNG and JPEG that end as their format does are
+    not decoded. The end of a thumbnail may stand before it."""
     ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
     with suppress(OSError), find_path(path).open("rb") as file:
         start = file.read(4)
         file.seek(max(0, file.seek(0, os.SEEK_END) - 8))
         tail = file.read()
         if any(start.startswith(magic) and tail.endswith(end) for magic, end in ends.items()):
-            return False
+            return None
+    reason = ""
     for read in (read_image, lambda path: read_depth_image(path, 1.0)):
         try:
             read(path)
-        except UnreadableImageError:
+        except UnreadableImageError as error:
+            reason = reason or str(error)
             continue
         except RecordingError:  # depth of another unit
             pass
-        return False
-    return True
+        return None
+    return reason if ": pixels of" in reason else str(path)

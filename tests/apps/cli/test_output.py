@@ -175,6 +175,29 @@ def test_the_null_device_takes_the_place_of_closed_streams(closed: tuple[int, ..
     assert subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
+@pytest.mark.parametrize("device", ["/dev/full", "closed pipe"])
+def test_the_work_goes_on_without_a_standard_error(device: str, room_map: Path):
+    """Only the warnings are lost."""
+    if device == "/dev/full" and not Path(device).is_char_device():
+        pytest.skip("no /dev/full here")
+    run = (
+        "import sys; from topoloc.apps.cli import main, output\n"
+        "for k in range(3): output.print_warning(str(k))\n"
+        "sys.exit(main(['info', sys.argv[1]]))"
+    )
+    reading, writing = os.pipe()
+    os.close(reading)
+    with (
+        open(writing, "wb") as gone,
+        open(os.devnull if device != "/dev/full" else device, "wb") as full,
+    ):
+        error = gone if device == "closed pipe" else full
+        command = [sys.executable, "-c", run, str(room_map)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=error, check=False)
+    assert done.returncode == 0
+    assert b"nodes" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("value", "is_kept", "num_lines"),
     [("1700000000", True, 0), ("", False, 0), ("1e9", False, 1), ("1700000000000", False, 1)],

@@ -110,11 +110,11 @@ def main(args: list[str] | None = None) -> int:
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # the reader of the output has closed it
-        _discard_output(sys.stdout)
+        discard_output(sys.stdout)
     except OSError as error:
         if error.errno not in _DISK_ERRNOS:
             raise
-        _discard_output(sys.stdout)
+        discard_output(sys.stdout)
         _print_error(f"cannot write the output: {error.strerror}")
     return 1
 
@@ -294,10 +294,10 @@ def _print_line(line: str) -> None:
     try:
         print(printable(line), file=sys.stderr)
     except OSError:  # only the exit status remains
-        _discard_output(sys.stderr)
+        discard_output(sys.stderr)
 
 
-def _discard_output(stream: TextIO) -> None:
+def discard_output(stream: TextIO) -> None:
     """Discard the buffered output of `stream`, so that it raises no error at exit."""
     with contextlib.suppress(OSError):  # a stream without a file
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

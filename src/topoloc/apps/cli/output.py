@@ -19,7 +19,7 @@ import tyro
 import topoloc  # most names of it load OpenCV; `topoloc doctor` must run without
 from topoloc import MissingExtraError, TopolocError
 from topoloc.apps import core_names
-from topoloc.apps.cli import printable
+from topoloc.apps.cli import discard_output, printable
 from topoloc.apps.core_names import remove_stale_files
 from topoloc.apps.report.plotting import load_matplotlib
 from topoloc.plugin import write_text
@@ -228,8 +228,14 @@ def import_report_writer() -> Callable[..., None]:
 
 
 def print_line(text: str, file: Any = None) -> None:
-    """Print one line, by default on standard output. Control characters are written as escapes."""
-    print(printable(text), file=file, flush=True)
+    """Print one line, by default on standard output. Control characters are written as escapes. The
+    work goes on without a standard error that cannot be written."""
+    try:
+        print(printable(text), file=file, flush=True)
+    except OSError:
+        if file is None or file is not sys.stderr:
+            raise
+        discard_output(sys.stderr)
 
 
 def print_warning(text: str) -> None:
