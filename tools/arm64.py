@@ -103,7 +103,7 @@ def add_debian(root: Path) -> None:
 def add_wheels(root: Path) -> None:
     """Install what topoloc and its tests need for aarch64, at the versions of constraints.txt."""
     project = tomllib.loads((HERE / "pyproject.toml").read_text())["project"]
-    tools = {"beartype", "hypothesis", "jsonschema", "onnx", "pytest", "scipy"}
+    tools = {"beartype", "hypothesis", "jsonschema", "onnx", "pyproj", "pytest", "scipy"}
     listed = map(Requirement, project["dependencies"] + project["optional-dependencies"]["test"])
     wanted = [
         one

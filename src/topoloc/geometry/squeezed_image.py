@@ -126,7 +126,10 @@ def _search_ratio(matches: _Matches, whole: _Found) -> tuple[float, _Found | Non
             direction, (cost, at, best) = now[1] - at, now
         if at == 0.0:
             break
-    return (at, best) if cost < least else (0.0, None)
+    belief = best[0].camera
+    # a panorama looks squeezed as well, but only with a lens
+    is_plain = belief is not None and belief.reported.lens == "none" and not belief.is_contradicted
+    return (at, best) if is_plain and cost < least else (0.0, None)
 
 
 def _unsqueezed(camera: Camera) -> Camera:

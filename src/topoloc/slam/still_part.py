@@ -25,7 +25,7 @@ def find_still_part(sequence: StereoSequence) -> str | None:
     ]
     if len(images) < min_images:
         return None
-    cells = np.float32(images).reshape(len(images), _ROWS, _CELL_PX, _COLUMNS, _CELL_PX)
+    cells = np.array(images, np.float32).reshape(len(images), _ROWS, _CELL_PX, _COLUMNS, _CELL_PX)
     texture = cells.std(axis=(2, 4)).mean(axis=0)
     change = np.median(np.abs(np.diff(cells, axis=0)).mean(axis=(2, 4)), axis=0)
     is_textured = texture > min_texture

@@ -92,8 +92,7 @@ def _examine_processor() -> Found:
 
 def _examine_extras() -> Found:
     """Return the extras, and the missing libraries of each. None: this platform has none."""
-    extras = metadata.metadata("topoloc").get_all("Provides-Extra", [])
-    facts = dict[str, Any].fromkeys(one for one in extras if one not in ("all", "docs", "test"))
+    facts: dict[str, Any] = {one: None for one in _extras() if one not in ("all", "docs", "test")}
     for extra, library in _requirements():
         if extra in facts:
             one = facts[extra] = facts[extra] or {"missing": [], "install": None}
@@ -217,17 +216,20 @@ def _describe(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _requirements() -> Iterator[tuple[str, Requirement]]:
     """Yield the extra, empty for the program itself, and each library that topoloc may use on this
     platform."""
-    try:
-        lines = metadata.requires("topoloc") or []
-    except metadata.PackageNotFoundError:
-        return
-    extras = metadata.metadata("topoloc").get_all("Provides-Extra", [])
-    for one in map(Requirement, lines):
-        for extra in ("", *extras):
+    for one in map(Requirement, (metadata.requires("topoloc") or []) if _extras() else []):
+        for extra in ("", *_extras()):
             if one.marker is None or one.marker.evaluate({"extra": extra}):
                 yield extra, one
                 if not extra:
                     break
+
+
+def _extras() -> list[str]:
+    """Return the names of all extras, none if topoloc is not installed."""
+    try:
+        return metadata.metadata("topoloc").get_all("Provides-Extra", [])
+    except metadata.PackageNotFoundError:
+        return []
 
 
 def _version_of(name: str) -> str | None:
