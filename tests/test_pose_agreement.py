@@ -11,8 +11,10 @@ import pytest
 
 SRC = Path(__file__).parents[1] / "src" / "topoloc"
 PREDICATE, ENGINE = "geometry/rigid.py", "geometry/transform_consensus.py"
-# Hypotheses of a stream consist of a pose and a velocity.
-OTHER_TESTS = {"tracking/motion.py:_is_same_motion"}
+OTHER_TESTS = {
+    "tracking/motion.py:_is_same_motion",  # hypotheses of a pose and a velocity
+    "apps/formats/bags/bag_poses.py:_interpolate_correction",  # a jump between two times
+}
 # It draws triples of points. `find_least_median` compares their transforms.
 OTHER_ENGINES = {
     "mapping/georeference_fit.py:_robust_weights",

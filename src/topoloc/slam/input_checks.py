@@ -64,7 +64,8 @@ def check_stereo(sequence: StereoSequence) -> None:
         )
     are_pairs = [_is_pair(one, rig.left.width) for one in shifts]
     if is_pair or np.mean(are_pairs) > min_good_share:
-        _check_stretches(sequence, list(zip(rows, are_pairs, strict=True)))
+        most = len(sequence) if is_pair else 1  # few pairs among others match by chance
+        _check_stretches(sequence, list(zip(rows, are_pairs, strict=True)), most)
     if not is_pair:
         raise RecordingError(
             f"{sequence.name}: left and right pictures are no pairs: the same points are"
@@ -73,8 +74,11 @@ def check_stereo(sequence: StereoSequence) -> None:
         )
 
 
-def _check_stretches(sequence: StereoSequence, checked: Sequence[tuple[int, bool]]) -> None:
-    """Raise RecordingError if two pairs in a row, or more, are none. Names the first frame."""
+def _check_stretches(
+    sequence: StereoSequence, checked: Sequence[tuple[int, bool]], most: int
+) -> None:
+    """Raise RecordingError if two pairs in a row, or more, are none, in at most so many stretches.
+    Names the first frame."""
     stretches, last = list[tuple[int, int]](), (-1, True)
     for pair, following in zip(checked, [*checked[1:], (len(sequence), True)], strict=True):
         is_alone = last[1] and following[1]  # one pair may have been matched wrongly
@@ -85,7 +89,7 @@ def _check_stretches(sequence: StereoSequence, checked: Sequence[tuple[int, bool
                 end = _find_change(sequence, following[0], pair[0])
                 stretches[-1] = stretches[-1][0], end
         last = pair
-    if not stretches:
+    if not 0 < len(stretches) <= most:
         return
     edges = [0, *(edge for stretch in stretches for edge in stretch), len(sequence)]
     parts = zip(edges[::2], edges[1::2], strict=True)

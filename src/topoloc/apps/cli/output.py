@@ -50,7 +50,7 @@ CameraOption = Annotated[
     option(
         "FILE|fx,fy,cx,cy",
         "that of the recording",
-        help="Calibration that replaces the recordings' own: camera.json, OpenCV's or Kalibr's"
+        help="Calibration instead of their own: camera.json, OpenCV's or Kalibr's"
         " YAML, COLMAP's cameras.txt, SN*.conf, or `fx,fy,cx,cy`.",
     ),
 ]
