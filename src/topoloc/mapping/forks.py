@@ -1,7 +1,7 @@
-"""Let a forked child use what other threads of its parent used at the fork.
+"""Keep locks usable in a forked child whose parent had other threads.
 
-Only the forking thread exists in the child. A lock of another one would stay locked there, and what
-it guards could be half changed. So a fork waits for the locks of `fork_safe`, and the child renews
+Only the forking thread exists in the child. A lock of another one would stay locked there, and its
+data could be half changed. So a fork waits for the locks of `fork_safe`, and the child renews
 all. That of a `cached_property` (until Python 3.12) is only renewed: a value is computed under it,
 which takes long, and the child computes it again.
 """

@@ -73,14 +73,16 @@ def _score_neighbours(sequence: StereoSequence, row: int) -> tuple[float, float,
     """Return how well the depth of a frame fits the images before it, of it, and after it."""
     frame, scores, near = sequence[row], list[float](), slice(_MAX_SHIFT - 2, _MAX_SHIFT + 3)
     for other in (row - 1, row, row + 1):
-        found = _correlate_edges(replace(frame, image=sequence[other].image))
+        found = _correlate_edges(replace(frame, image=sequence[other].image), np.ones(1))
         if found is None:
             return None
-        scores.append(float(found[len(_ZOOMS) // 2, near, near].max()))
+        scores.append(float(found[0, near, near].max()))
     return scores[0], scores[1], scores[2]
 
 
-def _correlate_edges(frame: StereoFrame) -> Float[np.ndarray, "zooms s s"] | None:
+def _correlate_edges(
+    frame: StereoFrame, zooms: Float[np.ndarray, " zooms"] = _ZOOMS
+) -> Float[np.ndarray, "zooms s s"] | None:
     """Return the contrast at the near sides of jumps in depth, less the mean contrast of the image
     and relative to it, for each zoom and shift (down, right) of depth. None if there are few."""
     min_jump, min_pixels, border_px = 0.08, 200, 8
@@ -101,7 +103,7 @@ def _correlate_edges(frame: StereoFrame) -> Float[np.ndarray, "zooms s s"] | Non
     contrast = cv2.resize(contrast, (_WIDTH, height), interpolation=cv2.INTER_AREA)
     mean, shape = float(contrast.mean()), (height + 2 * _MAX_SHIFT, _WIDTH + 2 * _MAX_SHIFT)
     spectrum, scores = np.fft.rfft2(contrast - mean, shape), []
-    for zoom in _ZOOMS:
+    for zoom in zooms:
         pixels = np.rint(scale * (zoom * (points - centre) + centre)).astype(int)
         pixels = pixels[((pixels >= 0) & (pixels < contrast.shape)).all(axis=1)]
         edges = np.zeros(contrast.shape)

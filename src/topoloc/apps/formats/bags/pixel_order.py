@@ -1,4 +1,4 @@
-"""Tell from the pixels whether a driver names the wrong order of their bytes.
+"""Decide from the pixels whether a driver labels the wrong order of their bytes.
 
 Numbers of 16 bits and of floats are smooth in their true order alone. Of YUV 4:2:2, brightness
 changes from pixel to pixel more than colour does. Reversing the bytes of each pixel mends both.
@@ -25,8 +25,8 @@ _NUM_SAMPLES, _NUM_ROWS, _MIN_PAIRS = 5, 200, 100
 
 
 def has_reversed_bytes(bag: Bag, topic: Topic, refs: list[MessageRef]) -> bool:
-    """Return whether the pixels of a topic have the other order of bytes than they say. A note says
-    so. Pixels that do not tell have the order that they say."""
+    """Return whether the pixels of a topic have another order of bytes than their label. A note is
+    added. Pixels that do not decide keep the label."""
     if topic.type not in RAW_IMAGE_TYPES or not _is_ordered(bag, topic, refs[0]):
         return False
     samples = list(_read_samples(bag, topic, refs))
@@ -48,7 +48,7 @@ def _is_ordered(bag: Bag, topic: Topic, ref: MessageRef) -> bool:
 
 
 def _read_samples(bag: Bag, topic: Topic, refs: list[MessageRef]) -> Iterator[tuple[float, str]]:
-    """Yield the evidence of images that tell, and the order that they say."""
+    """Yield the evidence of images that decide, and their label."""
     for ref in refs[:: -(-len(refs) // _NUM_SAMPLES)]:
         with suppress(RecordingError, UnreadableImageError):
             message = decode(topic, bag.read(ref))
@@ -62,7 +62,7 @@ def _read_samples(bag: Bag, topic: Topic, refs: list[MessageRef]) -> Iterator[tu
 
 def _compare_orders(message: Any) -> float:
     """Return the evidence for the other order of bytes: sure above 1, NaN if the image does not
-    tell."""
+    decide."""
     pixels, to_rgb = decode_pixels(message, "")
     step = max(1, len(pixels) // _NUM_ROWS)
     pixels = pixels[::step]
