@@ -139,7 +139,7 @@ def test_no_kernel_uses_numbas_own_threads():
 
 def test_a_number_of_threads_is_taken_and_changes_no_feature():
     code = (
-        "import sys, numpy as np, topoloc, cv2, faiss\n"
+        "import sys, numpy as np, topoloc, cv2\n"
         "from topoloc.features.extraction import FeatureConfig, extract_features\n"
         "picture = np.random.default_rng(0).integers(0, 255, (200, 200), np.uint8)\n"
         "first = extract_features(picture, FeatureConfig())\n"
@@ -147,14 +147,14 @@ def test_a_number_of_threads_is_taken_and_changes_no_feature():
         "    topoloc.set_num_threads(number)\n"
         "    again = extract_features(picture, FeatureConfig())\n"
         "    assert again.descriptors.tobytes() == first.descriptors.tobytes() and len(again)\n"
-        "    print(cv2.getNumThreads(), faiss.omp_get_max_threads())\n"
+        "    print(cv2.getNumThreads())\n"
         "try:\n    topoloc.set_num_threads(0)\n"
         "except ValueError as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.splitlines() == [
-        "1 1",
-        "3 3",
+        "1",
+        "3",
         "at least one thread is needed, not 0",
     ], done.stderr
 

@@ -71,10 +71,10 @@ def set_num_threads(number: int) -> None:
     2 threads, and 1 for the networks of learned coarse localizers. Results do not depend on the
     number, except for the last digits of the scores of such a network.
 
-    The number holds for topoloc in this process and for OpenCV, FAISS and PyTorch (if it is
-    loaded). If several threads share a `Localizer`, each of them uses this number. NumPy's number
-    of threads must be set before NumPy is loaded, by `OPENBLAS_NUM_THREADS`. The command line sets
-    it to 1 if it is unset.
+    The number holds for topoloc in this process and for OpenCV and PyTorch (if it is loaded). If
+    several threads share a `Localizer`, each of them uses this number. NumPy's number of threads
+    must be set before NumPy is loaded, by `OPENBLAS_NUM_THREADS`. The command line sets it to 1 if
+    it is unset.
 
     Raises:
         ValueError: `number` is below 1.
@@ -82,11 +82,9 @@ def set_num_threads(number: int) -> None:
     if number < 1:
         raise ValueError(f"at least one thread is needed, not {number}")
     import cv2
-    import faiss
 
     _configured[:] = [number]
     cv2.setNumThreads(number)
-    faiss.omp_set_num_threads(number)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(number)
 

@@ -292,10 +292,9 @@ def test_the_command_line(
     )
     facts = json.loads(capsys.readouterr().out)
     assert facts["worlds"] == {"centre": ["centre", "left", "right"]}
-    assert [(join["first"], join["second"]) for join in facts["joins"]] == [
-        ("centre", "right"),
-        ("left", "right"),
-    ]
+    joined = [{join["first"], join["second"]} for join in facts["joins"]]
+    assert len(joined) == 2
+    assert set.union(*joined) == {"centre", "left", "right"}
     assert all(
         0.0 < join["sigma_m"] < 0.05 and 0.0 < join["sigma_deg"] < 2.0 for join in facts["joins"]
     )

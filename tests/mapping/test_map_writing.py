@@ -40,12 +40,16 @@ def test_everything_comes_back(tiny_map: TopoMetricMap, saved: Path):
             )
         assert one.camera == other.camera
         assert one.template_image == other.template_image
-        for name in ("points_img", "sizes_px", "angles", "responses"):
-            np.testing.assert_array_equal(
-                getattr(one.features, name), getattr(other.features, name)
-            )
-        np.testing.assert_array_equal(one.points_cam, other.points_cam)
-        np.testing.assert_allclose(one.point_sqrt_covs, other.point_sqrt_covs, rtol=1e-3, atol=1e-6)
+        for name, rtol, atol in (
+            ("points_img", 0.0, 1 / 128),
+            ("sizes_px", 1 / 256, 0.0),
+            ("angles", 0.0, 1 / 128),
+            ("responses", 1 / 256, 0.0),
+        ):
+            stored, given = (getattr(node.features, name) for node in (one, other))
+            np.testing.assert_allclose(stored, given, rtol=rtol, atol=atol)
+        np.testing.assert_allclose(one.points_cam, other.points_cam, rtol=2**-16)
+        np.testing.assert_allclose(one.point_sqrt_covs, other.point_sqrt_covs, rtol=1e-2, atol=1e-6)
     for one, other in zip(loaded.place_images, tiny_map.place_images, strict=True):
         assert (one.recording, one.name, one.node_id, one.jpeg) == (
             other.recording,
@@ -67,7 +71,7 @@ def test_descriptors_come_back_within_quantisation(tiny_map: TopoMetricMap, save
         )
         cosines = np.sum(one.features.descriptors * other.features.descriptors, axis=1)
         assert cosines.min() > 0.95
-        assert np.median(cosines) > 0.999
+        assert np.median(cosines) > 0.99
 
 
 def test_each_feature_type_has_its_own_quantisation(

@@ -226,14 +226,13 @@ def test_sides_come_back_from_the_file(sides: VirtualNodes, saved_corridor: Path
             np.testing.assert_array_equal(s.world_from_cam.matrix(), o.world_from_cam.matrix())
         assert one.camera == other.camera
         for name in ("points_img", "sizes_px", "angles", "responses"):
-            np.testing.assert_array_equal(
-                getattr(one.features, name), getattr(other.features, name)
-            )
+            stored, given = (getattr(node.features, name) for node in (one, other))
+            np.testing.assert_allclose(stored, given, rtol=1 / 256, atol=1 / 128)
         assert (
-            np.median(np.sum(one.features.descriptors * other.features.descriptors, axis=1)) > 0.999
+            np.median(np.sum(one.features.descriptors * other.features.descriptors, axis=1)) > 0.99
         )
-        np.testing.assert_array_equal(one.points_cam, other.points_cam)
-        np.testing.assert_allclose(one.point_sqrt_covs, other.point_sqrt_covs, rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(one.points_cam, other.points_cam, rtol=2**-16)
+        np.testing.assert_allclose(one.point_sqrt_covs, other.point_sqrt_covs, rtol=1e-2, atol=1e-6)
     (one,), (other,) = loaded.coarse_models.values(), sides.coarse_models.values()
     assert (one.name, one.settings) == (other.name, json.loads(json.dumps(other.settings)))
     for name in other.arrays:

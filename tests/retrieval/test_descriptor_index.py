@@ -82,20 +82,22 @@ def test_cells_look_further_where_one_node_has_most_images():
     assert len({score.row for score in ranking}) == 3
 
 
-def test_words_do_not_depend_on_the_number_of_threads_which_stays_as_it_was():
-    descriptors, before, words = (
-        unit(np.random.default_rng(4).standard_normal((3000, 16))),
-        faiss.omp_get_max_threads(),
-        [],
-    )
-    try:
-        for number in (1, 3):
-            faiss.omp_set_num_threads(number)
-            words.append(learn_visual_words(descriptors, 32, seed=0))
-            assert faiss.omp_get_max_threads() == number
-    finally:
-        faiss.omp_set_num_threads(before)
-    np.testing.assert_array_equal(*words)
+def test_words_are_the_centres_of_clusters():
+    rng = np.random.default_rng(4)
+    centres = unit(rng.standard_normal((12, 16)))
+    descriptors = unit(np.repeat(centres, 250, axis=0) + 0.02 * rng.standard_normal((3000, 16)))
+    words = learn_visual_words(descriptors, 48, seed=0)
+    nearest = np.max(centres @ unit(words).T, axis=1)
+    assert words.shape == (48, 16)
+    assert nearest.min() > 0.99
+    np.testing.assert_array_equal(words, learn_visual_words(descriptors, 48, seed=0))
+
+
+def test_without_faiss_many_vectors_are_compared_exactly(monkeypatch: pytest.MonkeyPatch):
+    vectors = unit(np.random.default_rng(3).standard_normal((300, 8)))
+    monkeypatch.setattr("topoloc.retrieval.descriptor_index.find_spec", lambda _: None)
+    index = DescriptorIndex(vectors, np.arange(300), max_exact=100)
+    assert [index.rank_nodes(vector, 1)[0].row for vector in vectors] == list(range(300))
 
 
 def test_each_python_thread_has_its_own_number_of_faiss_threads():

@@ -1,10 +1,11 @@
 """A shard of an atlas's index: the global descriptors of many tiles for one feature type.
 
-FAISS stores a product-quantised code of each descriptor (4 bits for two components) in the cell of
-its nearest centre. A query searches the nearest eighth of the cells, at least 96. The candidates
-nearest by code are then compared by their full vectors. These are half floats in a memory-mapped
-file, so only used pages are loaded and processes share them. One file holds the shard with a
-checksum. It can be rebuilt at any time.
+A shard of more than 8,192 descriptors needs FAISS (extra `atlas`). It stores a product-quantised
+code of each descriptor (4 bits for two components) in the cell of its nearest centre. A query
+searches the nearest eighth of the cells, at least 96. The candidates nearest by code are then
+compared by their full vectors. These are half floats in a memory-mapped file, so only used pages
+are loaded and processes share them. One file holds the shard with a checksum. It can be rebuilt at
+any time.
 """
 
 from __future__ import annotations
@@ -17,15 +18,13 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
-import faiss as faiss_module
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int
 
-from topoloc.errors import AtlasError
+from topoloc.errors import AtlasError, MissingExtraError
 from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.descriptor_index import single_faiss_thread
 
-faiss: Any = faiss_module  # its type stubs lack overloads
 NUM_COMPARED, MAX_COMPARED = 1024, 16_384
 """Number of candidates compared by full vectors. If they belong to too few tiles, it grows by eight
 times, up to the second number."""
@@ -56,7 +55,7 @@ class DescriptorShard:
         vocabulary: version of the vocabulary of the vectors.
         tiles: the tiles, in the order of their vectors.
         vectors: unit vectors of all tiles.
-        codes: FAISS index of the vectors. None: it is built.
+        codes: FAISS index of the vectors. None: it is built, if there are so many.
     """
 
     def __init__(
@@ -70,10 +69,8 @@ class DescriptorShard:
         self.kind, self.vocabulary = kind, vocabulary
         self.tiles, self.vectors = list(tiles), vectors
         self.bounds: Int[np.ndarray, " _"] = np.cumsum([0, *(tile.num_rows for tile in tiles)])
-        self._codes = _build_codes(vectors) if codes is None else codes
-        self._num_probes = min(
-            self._codes.nlist, max(_MIN_PROBES, round(self._codes.nlist / _CELLS_PER_PROBE))
-        )
+        is_large = len(vectors) > MAX_ROWS_COMPARED
+        self._codes: Any = _build_codes(vectors) if codes is None and is_large else codes
         self._chosen: tuple[bytes, Any] | None = None
 
     @property
@@ -121,7 +118,9 @@ class DescriptorShard:
             rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
         else:
             chosen = None if len(asked) == len(is_selected) else self._select_tile_rows(is_selected)
-            parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)
+            num_cells = self._codes.nlist
+            num_probes = min(num_cells, max(_MIN_PROBES, round(num_cells / _CELLS_PER_PROBE)))
+            parameters = _faiss().SearchParametersIVF(nprobe=num_probes, sel=chosen)
             with single_faiss_thread():
                 found = self._codes.search(vector[None], min(count, num_rows), params=parameters)
             rows = found[1][0][found[1][0] >= 0]
@@ -137,7 +136,7 @@ class DescriptorShard:
         key, known = is_selected.tobytes(), self._chosen
         if known is None or known[0] != key:
             bits = np.packbits(np.repeat(is_selected, np.diff(self.bounds)), bitorder="little")
-            self._chosen = known = key, faiss.IDSelectorBitmap(bits)
+            self._chosen = known = key, _faiss().IDSelectorBitmap(bits)
         return known[1]
 
     def save(self, folder: Path) -> Path:
@@ -146,7 +145,8 @@ class DescriptorShard:
         Raises:
             OSError: it cannot be written.
         """
-        codes = faiss.serialize_index(self._codes)
+        has_codes = self._codes is not None
+        codes = _faiss().serialize_index(self._codes).tobytes() if has_codes else b""
         facts = {
             "kind": self.kind,
             "vocabulary": self.vocabulary,
@@ -166,7 +166,7 @@ class DescriptorShard:
 
             file.write(_MAGIC + bytes(32))
             write(len(header).to_bytes(8, "little") + header)
-            write(codes.tobytes())
+            write(codes)
             write(bytes(-file.tell() % _ALIGNMENT))
             for start in range(0, len(self.vectors), _CHUNK):
                 write(np.ascontiguousarray(self.vectors[start : start + _CHUNK]).data)
@@ -198,15 +198,15 @@ def _opened(path: Path) -> DescriptorShard:
         file.seek(len(_MAGIC) + 32)
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
         data = np.frombuffer(file.read(header["num_bytes_of_codes"]), np.uint8)
-        codes = faiss.deserialize_index(data)
+        codes = _faiss().deserialize_index(data) if len(data) else None
         start = file.tell() + -file.tell() % _ALIGNMENT
     num_rows, dimension = header["shape"]
     mapped = np.memmap(path, np.float16, "r", start, (num_rows, dimension))
     tiles = [ShardTile(*tile) for tile in header["tiles"]]
-    if (codes.ntotal, codes.d, sum(tile.num_rows for tile in tiles)) != (
-        num_rows,
-        dimension,
-        num_rows,
+    of_codes = (num_rows, dimension) if codes is None else (codes.ntotal, codes.d)
+    is_small = num_rows <= MAX_ROWS_COMPARED
+    if (*of_codes, sum(tile.num_rows for tile in tiles)) != (num_rows, dimension, num_rows) or (
+        codes is None and not is_small
     ):
         raise ValueError("its parts do not belong together")
     return DescriptorShard(header["kind"], header["vocabulary"], tiles, np.asarray(mapped), codes)
@@ -214,6 +214,7 @@ def _opened(path: Path) -> DescriptorShard:
 
 def _build_codes(vectors: Float16[np.ndarray, "n d"]) -> Any:
     """Build the FAISS index: k-means cells of a sample, and the codes of all vectors."""
+    faiss = _faiss()
     num_rows, dimension = vectors.shape
     num_cells = max(1, min(round(math.sqrt(num_rows)), _MAX_CELLS))
     num_parts = dimension // 2 if dimension % 2 == 0 else dimension
@@ -227,3 +228,12 @@ def _build_codes(vectors: Float16[np.ndarray, "n d"]) -> Any:
         for start in range(0, num_rows, _CHUNK):
             index.add(vectors[start : start + _CHUNK].astype(np.float32))
     return index
+
+
+def _faiss() -> Any:  # its type stubs lack overloads
+    """Return FAISS. Raises MissingExtraError."""
+    need = f"an atlas of more than {MAX_ROWS_COMPARED} images needs FAISS"
+    with MissingExtraError.on_import(need, "atlas"):
+        import faiss
+
+        return faiss

@@ -70,7 +70,7 @@ class FeatureType:
         distant: thresholds for key points far from it, if the pose is only that of a nearby node.
         normalization: default normalisation of the image, see `FeatureConfig`.
         descriptor_scale: a map file stores each component times this number as a signed byte.
-            Values above 127 (0.63 at a scale of 200) are clipped.
+            At 25 a step is a third of a component's root mean square of 64 components.
         has_scale, has_angle: whether `Features.sizes_px` and `angles` vary with the image. If not,
             they are constant and matching ignores them.
         sigma_px: standard deviation of a matched key point along x and along y, pixels.
@@ -89,7 +89,7 @@ class FeatureType:
     guided: GuidedThresholds
     distant: GuidedThresholds
     normalization: Normalization = "wide"
-    descriptor_scale: float = 200.0
+    descriptor_scale: float = 25.0
     has_scale: bool = True
     has_angle: bool = True
     sigma_px: float = 1.0

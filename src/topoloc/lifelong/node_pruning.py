@@ -10,12 +10,6 @@ lose its support. The support of nodes already removed counts in later steps.
 Within a node, landmarks with a high observation probability are kept. They are spread over the
 image, because a landmark beside others adds less. The objective is a submodular coverage: a cell of
 the image counts as the square root of the sum of its probabilities (greedy choice).
-
-Descriptors take half of a landmark's bytes. A file stores their numbers as signed bytes and
-compresses them, so fewer different values take fewer bits. A map reads them as usual, because the
-length of a descriptor does not matter. The default step is 0.64 times a number's root mean square
-(16 times the file's step for 64 numbers). With it, the scalar product of two descriptors changes by
-0.02. `benchmarks/descriptor_size.py` compares this with product quantization and with signs alone.
 """
 
 from __future__ import annotations
@@ -30,14 +24,9 @@ from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.mapping.node_drafts import collect_virtual_nodes, observe_node
 from topoloc.mapping.nodes import find_nearest_nodes
 from topoloc.mapping.storage.entries import change_each
-from topoloc.mapping.storage.point_encoding import dequantize_descriptors, quantize_descriptors
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
-
-# A node counts as quantized if the median norm of its stored descriptors is at most this many times
-# the norm expected for the step.
-_MAX_NORM_RATIO = 1.5
 
 
 def transform_nodes(
@@ -52,25 +41,6 @@ def transform_nodes(
         for kind, layer in topomap.layers.items()
     }
     return replace(topomap, layers=layers)
-
-
-def quantize_node_descriptors(node: TopoNode, step: float) -> TopoNode:
-    """Return the node with its descriptors quantized, or the same node if they are quantized
-    already. `step` is in root mean squares of a descriptor's numbers."""
-    stored, descriptors = node.stored_descriptors, node.features.descriptors
-    scale = np.sqrt(descriptors.shape[1]) / step
-    if stored is not None and len(stored) > 0:
-        norms = np.linalg.norm(stored.astype(np.float32), axis=1)
-        if np.median(norms) <= _MAX_NORM_RATIO * scale:
-            return node
-    if len(descriptors) == 0:
-        return node
-    rounded = quantize_descriptors(descriptors, scale)
-    return replace(
-        node,
-        features=replace(node.features, descriptors=dequantize_descriptors(rounded)),
-        stored_descriptors=rounded,
-    )
 
 
 def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:

@@ -1,9 +1,9 @@
 """Make a map smaller. Start reading at `prune`.
 
 Vanished landmarks are removed first. A landmark has vanished if many images that show its
-neighbours again never show it. Descriptors are then quantized on request. With a
-size budget, nodes supported by others are removed if every node would otherwise keep few landmarks.
-Each remaining node then keeps as many landmarks as fit (`node_pruning.py`).
+neighbours again never show it. With a size budget, nodes supported by others are removed if every
+node would otherwise keep few landmarks. Each remaining node then keeps as many landmarks as fit
+(`node_pruning.py`).
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from topoloc.lifelong.node_pruning import (
     choose_landmarks,
     compute_node_support,
     find_vanished,
-    quantize_node_descriptors,
     remove_nodes,
     select_landmarks,
     select_removed_nodes,
@@ -109,7 +107,6 @@ class PrunedFile:
 def prune(
     path: str | Path,
     max_mb: float | None = None,
-    descriptors: Literal["fine", "coarse"] = "fine",
     on_wait: WaitCallback | None = None,
 ) -> PrunedFile:
     """Remove from a map file the landmarks that are gone and, with a budget, those that add least.
@@ -117,7 +114,6 @@ def prune(
     Args:
         path: the map file, which is replaced if anything is removed.
         max_mb: megabytes that the file may have; None removes only landmarks that are gone.
-        descriptors: as of `prune_map`.
         on_wait: called if another process edits the map, before this one waits.
 
     Raises:
@@ -127,12 +123,11 @@ def prune(
     with edit_map(path, on_wait) as edit:
         before, length_m = edit.path.stat().st_size, edit.topomap.length_m
         max_bytes = None if max_mb is None else round(max_mb * 1e6)
-        topomap, changes = prune_map(edit.topomap, edit.path, max_bytes, descriptors)
+        topomap, changes = prune_map(edit.topomap, edit.path, max_bytes)
         changes |= {"bytes_before": before}
         if topomap is not edit.topomap:
             to_size = "" if max_mb is None else f" to {max_mb:g} MB"
-            how = ", descriptors coarse" if descriptors == "coarse" else ""
-            edit.commit(topomap, f"prune{to_size}{how}", changes)
+            edit.commit(topomap, f"prune{to_size}", changes)
     return PrunedFile(changes | {"bytes": Path(path).stat().st_size}, length_m)
 
 
@@ -140,21 +135,14 @@ def prune_map(
     topomap: TopoMetricMap,
     path: Path,
     max_bytes: int | None = None,
-    descriptors: Literal["fine", "coarse"] = "fine",
 ) -> tuple[TopoMetricMap, dict[str, Any]]:
     """Return the map without vanished landmarks and, if there is a budget (`max_bytes`), small
     enough for it. Return the numbers of changes by name, too.
 
-    The file of the map at `path` is the basis of the budget. `coarse` quantizes the descriptors
-    before any landmark is removed for the budget, `fine` keeps them. Raises MapError if the budget
-    is too small for 100 landmarks per node.
+    The file of the map at `path` is the basis of the budget. Raises MapError if
+    the budget is too small for 100 landmarks per node.
     """
-    # Step of coarse descriptors, in root mean squares of a descriptor's numbers. They are
-    # quantized before any landmark is removed for the budget.
-    descriptor_step = 0.64
     counted = transform_nodes(topomap, _merge_session_counts)
-    if descriptors == "coarse":
-        counted = transform_nodes(counted, partial(quantize_node_descriptors, step=descriptor_step))
     is_same = counted is topomap and topomap.file is not None
     file = _FileSize.measure(path, topomap.kinds) if is_same else measure_file_size(counted, path)
     fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -99,6 +99,28 @@ class LandmarkStatistics:
         is_empty = not self.pulls.any() and bool((np.abs(self.roots) <= _MAX_EMPTY_ROOT).all())
         return len(self.rows) > 0 and is_empty
 
+    def is_whole_information(self, sqrt_covs: Float[np.ndarray, "n 6"]) -> bool:
+        """Return whether no other session located the points: the information is the inverse of
+        their covariances, whose roots are `sqrt_covs` (metres), within 5 %."""
+        lower, roots = _lower_triangles(self.roots), _lower_triangles(sqrt_covs[self.rows])
+        identity = np.swapaxes(roots, 1, 2) @ lower
+        identity = identity @ np.swapaxes(identity, 1, 2)
+        return bool(np.all(np.abs(identity - np.eye(3)) < 0.05))
+
+    def with_whole_information(self, sqrt_covs: Float[np.ndarray, "n 6"]) -> LandmarkStatistics:
+        """Return the statistics of the only session that located the points: with the inverse of
+        their covariances. Raises CorruptDataError."""
+        roots = _lower_triangles(sqrt_covs[self.rows])
+        try:
+            information = np.linalg.inv(roots @ np.swapaxes(roots, 1, 2))
+            counts = self.expected.astype(np.int64), self.seen.astype(np.int64)
+            pulls = np.zeros((len(roots), 3))
+            return LandmarkStatistics.from_equations(
+                self.session_id, self.rows, information, pulls, *counts
+            )
+        except np.linalg.LinAlgError as error:
+            raise CorruptDataError(f"sums of session {self.session_id}: no covariances") from error
+
     def with_counts(self, counted: LandmarkStatistics) -> LandmarkStatistics:
         """Return the statistics with the counts of further images, of the same session or not."""
         rows = np.union1d(self.rows, counted.rows)
@@ -117,6 +139,12 @@ class LandmarkStatistics:
         other light may see none of them."""
         seen, expected = (counts.sum(dtype=np.int64) for counts in (self.seen, self.expected))
         return bool(seen >= 0.3 * expected)
+
+
+def _lower_triangles(numbers: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m 3 3"]:
+    lower = np.zeros((len(numbers), 3, 3))
+    lower[:, *np.tril_indices(3)] = numbers
+    return lower
 
 
 def merge_count_statistics(statistics: Iterable[LandmarkStatistics]) -> list[LandmarkStatistics]:
@@ -140,16 +168,19 @@ def _add_counts(parts: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
     return reduce(LandmarkStatistics.with_counts, others, last)
 
 
-def encode_statistics(statistics: LandmarkStatistics) -> bytes:
+def encode_statistics(statistics: LandmarkStatistics, sqrt_covs: Float[np.ndarray, "n 6"]) -> bytes:
     """Encode rows, roots, pulls and counts as 16-bit words, with all low bytes before all high
-    bytes, compressed by zlib."""
+    bytes, compressed by zlib. Roots and pulls are 0 if they follow from the covariances."""
+    if statistics.is_whole_information(sqrt_covs):
+        roots, pulls = np.zeros_like(statistics.roots), np.zeros_like(statistics.pulls)
+        statistics = replace(statistics, roots=roots, pulls=pulls)
     parts = (getattr(statistics, name).astype(dtype) for name, dtype, _ in _COLUMNS)
     words = np.frombuffer(b"".join(part.tobytes() for part in parts), np.uint8)
     return zlib.compress(np.ascontiguousarray(words.reshape(-1, 2).T).tobytes(), 6)
 
 
 def decode_statistics(
-    session_id: int, data: bytes, num_rows: int, num_points: int
+    session_id: int, data: bytes, num_rows: int, sqrt_covs: Float[np.ndarray, "n 6"]
 ) -> LandmarkStatistics:
     """Decode the bytes of `encode_statistics`. Raises CorruptDataError."""
     what = f"sums of session {session_id}"
@@ -162,6 +193,9 @@ def decode_statistics(
         data, words = words[: 2 * m * width], words[2 * m * width :]
         parts.append(array_from_bytes(data, dtype, (m, width) if width > 1 else (m,), what))
     rows = parts[0].astype(np.int64)
-    if m and (int(rows[-1]) >= num_points or (np.diff(rows) <= 0).any()):
+    if m and (int(rows[-1]) >= len(sqrt_covs) or (np.diff(rows) <= 0).any()):
         raise CorruptDataError(f"{what}: of points that are not there")
-    return LandmarkStatistics(session_id, rows, *parts[1:])
+    statistics = LandmarkStatistics(session_id, rows, *parts[1:])
+    if m and not statistics.roots.any():
+        return statistics.with_whole_information(sqrt_covs)
+    return statistics

@@ -4,21 +4,23 @@ nodes of these images."""
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
-import faiss
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Int, Int8
 
+from topoloc.errors import MapError
 from topoloc.node_ids import Row
-from topoloc.retrieval.coarse import NodeScore
+from topoloc.retrieval.coarse import CoarseModel, NodeScore, model_array
 from topoloc.retrieval.descriptor_kernels import multiply_rows
 
 # Up to this number every vector is compared, in 1 to 3 ms. Beyond it an inverted file nearly always
-# finds the same neighbour.
+# finds the same neighbour, if FAISS is installed.
 MAX_EXACT_VECTORS = 8_000
 # With an inverted file, this many of the nearest images are compared by more than their vectors.
 NUM_RERANKED_IMAGES = 2_000
@@ -46,7 +48,8 @@ class DescriptorIndex:
         max_exact: int = MAX_EXACT_VECTORS,
     ) -> None:
         self._node_rows = node_rows
-        vectors, is_exact = np.ascontiguousarray(vectors), len(vectors) <= max_exact
+        is_exact = len(vectors) <= max_exact or find_spec("faiss") is None
+        vectors = np.ascontiguousarray(vectors)
         self._vectors = vectors if is_exact else None
         self._cells: Any = None if is_exact else _build_inverted_file(vectors)
 
@@ -89,7 +92,8 @@ class DescriptorIndex:
         self, vector: Float32[np.ndarray, " d"], num_images: int
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
         num_images = min(num_images, len(self._node_rows))
-        similarities, rows = self._cells.search(np.ascontiguousarray(vector[None]), num_images)
+        with single_faiss_thread():
+            similarities, rows = self._cells.search(np.ascontiguousarray(vector[None]), num_images)
         found = rows[0] >= 0
         return rows[0][found], similarities[0][found]
 
@@ -107,6 +111,8 @@ class DescriptorIndex:
 def _build_inverted_file(vectors: Float32[np.ndarray, "n d"]) -> Any:
     """Build an inverted file with k-means centres of some of the vectors. Vectors are stored as
     half floats, half a kilobyte each at 256 dimensions."""
+    import faiss
+
     num_cells = max(1, min(round(math.sqrt(len(vectors))), len(vectors) // 40))
     dimension = vectors.shape[1]
     kind, metric = faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT
@@ -133,6 +139,42 @@ class Whitening:
         return np.ascontiguousarray(projected / lengths, np.float32)
 
 
+def pack_projection(projection: Float32[np.ndarray, "p d"]) -> dict[str, np.ndarray]:
+    """Return the arrays that store a projection in a third of its half floats: each row in steps of
+    a tenth of its root mean square, compressed by zlib."""
+    steps, sizes = _quantize(projection)
+    packed = np.frombuffer(zlib.compress(steps.tobytes()), np.uint8)
+    return {"projection": packed, "projection_steps": sizes}
+
+
+def unpack_projection(model: CoarseModel, length: int) -> Float32[np.ndarray, "p d"]:
+    """Return the projection, with rows of this length, of a stored model. Maps before schema 4 hold
+    half floats. Raises MapError."""
+    if "projection_steps" not in model.arrays:
+        return model_array(model, "projection", "f", (None, length)).astype(np.float32)
+    sizes = model_array(model, "projection_steps", "f", (None,)).astype(np.float32)
+    packed, num_bytes = model_array(model, "projection", "u", (None,)), len(sizes) * length
+    data = b""
+    with suppress(zlib.error):
+        data = zlib.decompressobj().decompress(packed.tobytes(), num_bytes)
+    if len(data) != num_bytes:
+        raise MapError(f"the map's coarse localizer {model.name!r} is damaged: its projection")
+    return _dequantize(np.frombuffer(data, np.int8).reshape(-1, length), sizes)
+
+
+def _quantize(
+    projection: Float32[np.ndarray, "p d"],
+) -> tuple[Int8[np.ndarray, "p d"], Float32[np.ndarray, " p"]]:
+    sizes = np.maximum(0.1 * np.sqrt(np.mean(projection**2, axis=1)), 1e-12).astype(np.float32)
+    return np.clip(np.rint(projection / sizes[:, None]), -127, 127).astype(np.int8), sizes
+
+
+def _dequantize(
+    steps: Int8[np.ndarray, "p d"], sizes: Float32[np.ndarray, " p"]
+) -> Float32[np.ndarray, "p d"]:
+    return steps * sizes[:, None]
+
+
 def learn_whitening(
     raw: Float32[np.ndarray, "n d"] | Sequence[Float32[np.ndarray, " d"]], dimension: int
 ) -> Whitening:
@@ -140,7 +182,8 @@ def learn_whitening(
     vectors of images.
 
     The mean variance is added to each variance. The trailing components of few images are noise,
-    which plain whitening would amplify.
+    which plain whitening would amplify. The projection is rounded as `pack_projection` stores it:
+    the vectors of a map and of its queries must use the same one.
     """
     rows = np.unique(np.linspace(0, len(raw) - 1, MAX_WHITENING_IMAGES).astype(int)).tolist()
     centred = np.stack([raw[k] for k in rows])
@@ -160,21 +203,33 @@ def learn_whitening(
         axes = centred.T @ axes / np.sqrt(eigenvalues[keep])
     regularized = np.sqrt(eigenvalues[keep] + eigenvalues[keep].mean())
     projection = np.ascontiguousarray((axes / regularized).T, np.float32)
-    return Whitening(mean.astype(np.float32), projection)
+    return Whitening(mean.astype(np.float32), _dequantize(*_quantize(projection)))
 
 
 def learn_visual_words(
     descriptors: Float32[np.ndarray, "n d"], num_words: int, seed: int
 ) -> Float32[np.ndarray, "k d"]:
-    """Return the k-means centres of descriptors, fewer than `num_words` if there are few
-    descriptors."""
+    """Return the k-means centres (Lloyd 1982) of descriptors, fewer than `num_words` if there are
+    few descriptors. At most 256 descriptors a word are used."""
     num_words = max(1, min(num_words, len(descriptors) // 40))
-    kmeans: Any = faiss.Kmeans(
-        descriptors.shape[1], num_words, niter=20, seed=seed + 1, min_points_per_centroid=1
-    )
-    with single_faiss_thread():
-        kmeans.train(np.ascontiguousarray(descriptors))
-    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)
+    order = np.random.default_rng(seed).permutation(len(descriptors))[: 256 * num_words]
+    sample = np.ascontiguousarray(descriptors[order], np.float32)
+    words = sample[:num_words].copy()
+    for _ in range(20):
+        nearest = _find_nearest_words(sample, words)
+        by_word = np.argsort(nearest, kind="stable")
+        used, starts, counts = np.unique(nearest[by_word], return_index=True, return_counts=True)
+        words[used] = np.add.reduceat(sample[by_word], starts) / counts[:, None]
+    return words
+
+
+def _find_nearest_words(
+    sample: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "k d"]
+) -> Int[np.ndarray, " n"]:
+    rows = max(1, 2**24 // len(words))  # 64 MB of products at a time
+    half_squares = 0.5 * np.sum(words**2, axis=1)
+    blocks = (sample[start : start + rows] for start in range(0, len(sample), rows))
+    return np.concatenate([np.argmax(one @ words.T - half_squares, axis=1) for one in blocks])
 
 
 @contextmanager
@@ -184,6 +239,8 @@ def single_faiss_thread() -> Iterator[None]:
 
     FAISS has one number of threads for each Python thread. So Python threads need no lock here.
     """
+    import faiss
+
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:

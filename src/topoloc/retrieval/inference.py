@@ -24,7 +24,7 @@ from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.retrieval.backbones import normalize_images
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, read_setting
-from topoloc.retrieval.descriptor_index import DescriptorIndex, Whitening
+from topoloc.retrieval.descriptor_index import DescriptorIndex, Whitening, unpack_projection
 from topoloc.retrieval.network_images import (
     ImageShape,
     NetworkInputConfig,
@@ -173,7 +173,7 @@ class NetworkDescriptorLocalizer:
                 f" {' '.join(str(error).split())[:200]}"
             ) from error
         mean = model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False)
-        projection = model_array(model, "projection", "f", (None, len(mean))).astype(np.float32)
+        projection = unpack_projection(model, len(mean))
         vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
         self._whitening = Whitening(mean, projection)
         node_rows = model_array(model, "node_ids", "iu", (len(vectors),))

@@ -29,7 +29,13 @@ from topoloc.bounds import drop_removed_settings, parse_settings
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, VladConfig, model_array
-from topoloc.retrieval.descriptor_index import DescriptorIndex, learn_visual_words, learn_whitening
+from topoloc.retrieval.descriptor_index import (
+    DescriptorIndex,
+    learn_visual_words,
+    learn_whitening,
+    pack_projection,
+    unpack_projection,
+)
 from topoloc.retrieval.descriptor_kernels import add_residuals, max_shifted_products, multiply_rows
 
 DIMENSION = 32
@@ -279,11 +285,11 @@ class SurfVlad:
 
     def to_model(self) -> CoarseModel:
         """Return the model stored in the map file. Vectors are half floats of a quarter to half a
-        kilobyte per image."""
+        kilobyte per image, the projection is compressed bytes."""
         arrays = {
             "words": self._words,
             "mean": self._mean,
-            "projection": self._projection.astype(np.float16),
+            **pack_projection(self._projection),
             "vectors": self._vectors.astype(np.float16),
             "node_ids": self._node_ids.astype(np.int32),
         }
@@ -298,7 +304,7 @@ class SurfVlad:
         settings = drop_removed_settings(model.settings, "build.vlad")
         config = parse_settings(VladConfig, {"position_weight": 0.0, **settings}, "settings")
         words = model_array(model, "words", "f", (None, None)).astype(np.float32, copy=False)
-        projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
+        projection = unpack_projection(model, words.size)
         mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)
         vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
         node_ids = model_array(model, "node_ids", "iu", (len(vectors),))

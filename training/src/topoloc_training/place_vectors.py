@@ -10,7 +10,7 @@ import numpy as np
 from torch import nn
 
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.descriptor_index import Whitening, learn_whitening
+from topoloc.retrieval.descriptor_index import learn_whitening, pack_projection
 from topoloc.retrieval.inference import Predictor
 from topoloc.retrieval.network_images import prepare_network_images
 from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig
@@ -46,14 +46,9 @@ def fit_vectors(
         progress(f"{name}: vectors", min(start + _CHUNK, len(pictures)), len(pictures))
     vectors = np.concatenate(raw)
     whitening = learn_whitening(vectors, config.dimension)
-    whitening = Whitening(
-        whitening.mean, whitening.projection.astype(np.float16).astype(np.float32)
-    )
     arrays = to_arrays(network) | {
         "mean": whitening.mean,
-        "projection": whitening.projection.astype(np.float16),
-    }
-    arrays |= {
+        **pack_projection(whitening.projection),
         "vectors": whitening.apply(vectors).astype(np.float16),
         "node_ids": training_set.node_ids.astype(np.int32),
     }

@@ -11,6 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from jaxtyping import Float32
+
 from topoloc.bounds import parse_settings
 from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.camera import Camera
@@ -233,8 +236,9 @@ def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: Row
         if not prefix:
             found = file.row("node_templates", f"the template of {what}", node_id=node_id)
             template = found["jpeg"]
-            statistics = _LazyStatistics(file, node_id, kind, points["num_points"])
         features, points_cam, sqrt_covs, stored = points_from_row(points, kind, file.version, what)
+        if not prefix:
+            statistics = _LazyStatistics(file, node_id, kind, sqrt_covs)
         n = len(features)
         if is_default and summary.num_points != n:
             raise CorruptDataError(f"node {node_id} has {n} points")
@@ -256,14 +260,17 @@ class _LazyStatistics:
     file: MapFile
     node_id: NodeId
     kind: str
-    num_points: int
+    sqrt_covs: Float32[np.ndarray, "n 6"]
 
     def __iter__(self) -> Iterator[LandmarkStatistics]:
-        n, what = self.num_points, f"the sums of node {self.node_id}"
+        n, what = len(self.sqrt_covs), f"the sums of node {self.node_id}"
         with self.file.read_connection():
             found = [
                 decode_statistics(
-                    row["session_id"], row["sums"], check_count(row["num_rows"], 0, n, what), n
+                    row["session_id"],
+                    row["sums"],
+                    check_count(row["num_rows"], 0, n, what),
+                    self.sqrt_covs,
                 )
                 for row in self.file.find("landmark_sums", node_id=self.node_id, kind=self.kind)
             ]

@@ -266,8 +266,9 @@ def _encode_node(
         size = node.features.descriptors.shape[1]
         rows.append(("node_points", node_id, kind, num_points, size, *blobs))
         rows += [
-            ("landmark_sums", node_id, kind, one.session_id, len(one.rows), encode_statistics(one))
+            ("landmark_sums", node_id, kind, one.session_id, len(one.rows), sums)
             for one in node.session_statistics
+            for sums in [encode_statistics(one, node.point_sqrt_covs)]
         ]
     return of_types[0][0], rows
 

@@ -1,9 +1,10 @@
 """Encode a node's points for the map file.
 
 Descriptors are signed bytes, roots of covariances are half floats, and the rest are single floats.
-Each array is compressed without loss by zlib. Exponents and signs of neighbouring numbers are
-similar, but their last digits are noise. So bytes of the same significance and column are stored
-together. Descriptors have no repetitions for zlib to find, so `Z_FILTERED` is used.
+All are rounded far below their noise, so that their last bits are 0. Each array is compressed
+without loss by zlib. Exponents and signs of neighbouring numbers are similar, but their last digits
+are noise. So bytes of the same significance and column are stored together. Descriptors have no
+repetitions for zlib to find, so `Z_FILTERED` is used.
 """
 
 from __future__ import annotations
@@ -45,14 +46,28 @@ descriptors."""
 def node_to_arrays(node: TopoNode, kind: str) -> list[np.ndarray]:
     """Return the node's arrays for the file, in the order of the table's columns."""
     f = node.features
-    shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
+    sizes_and_responses = round_mantissas(np.stack([f.sizes_px, f.responses], axis=1), 7)
+    shapes = np.insert(sizes_and_responses, 1, _round_to(f.angles, 1 / 64), axis=1)
     return [
-        f.points_img.astype("<f4"),
+        _round_to(f.points_img, 1 / 64),
         shapes,
         _stored_or_quantized(node, find_feature_type(kind).descriptor_scale),
-        node.points_cam.astype("<f4"),
-        node.point_sqrt_covs.astype("<f2"),
+        round_mantissas(node.points_cam, 15),
+        round_mantissas(node.point_sqrt_covs.astype("<f2"), 7),
     ]
+
+
+def round_mantissas(numbers: np.ndarray, num_bits: int) -> np.ndarray:
+    """Return half or single floats whose mantissas are rounded to `num_bits`. The relative error is
+    at most ``2 ** -(num_bits + 1)``."""
+    unused = np.finfo(numbers.dtype).nmant - num_bits
+    bits = np.ascontiguousarray(numbers).view(f"<u{numbers.itemsize}")
+    rounded = (bits + bits.dtype.type(1 << (unused - 1))) >> unused << unused
+    return rounded.view(numbers.dtype)
+
+
+def _round_to(numbers: np.ndarray, step: float) -> np.ndarray:
+    return (np.rint(numbers / step) * step).astype("<f4")
 
 
 def points_from_row(row: Mapping[str, Any], kind: str, schema: int, what: str) -> StoredPoints:

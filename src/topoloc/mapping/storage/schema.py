@@ -9,7 +9,7 @@ from hashlib import blake2b
 from typing import Any
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 VIRTUAL_PREFIX = "side_"
 
 Columns = dict[str, str]

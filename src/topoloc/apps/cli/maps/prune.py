@@ -1,10 +1,10 @@
-"""topoloc prune MAP|ATLAS [--max-mb N] [--descriptors coarse]."""
+"""topoloc prune MAP|ATLAS [--max-mb N]."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -29,8 +29,6 @@ class Command:
     max_mb: Annotated[float | None, option("N", "remove only landmarks that are gone")] = None
     """Maximum size of the map file in megabytes. In an atlas it holds for each tile. Every node
     keeps its most useful landmarks. Redundant nodes are removed before nodes keep too few."""
-    descriptors: Literal["fine", "coarse"] = "fine"
-    """`coarse` rounds descriptors to a third of their bytes before useful landmarks are removed."""
     tile: TileOption = None
     """Prune only this tile of an atlas."""
     json: File = None
@@ -43,9 +41,7 @@ class Command:
         place = open_place(self.map)
 
         def prune_tile(tile_id: str) -> dict[str, Any]:
-            pruned = place.edit(
-                tile_id, lambda path: prune(path, self.max_mb, self.descriptors, print_waiting)
-            )
+            pruned = place.edit(tile_id, lambda path: prune(path, self.max_mb, print_waiting))
             if self.json != "-":
                 text = describe_prune(pruned.changes, pruned.length_m / 1e3)
                 print_line(f"{place.title(tile_id)}: {text}")
