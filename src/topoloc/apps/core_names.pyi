@@ -37,6 +37,7 @@ from topoloc.recordings.open import find_format as find_format, split_selection 
 from topoloc.recordings.recording import (
     as_monocular as as_monocular,
     has_scale as has_scale,
+    keep_frames as keep_frames,
     scale_poses as scale_poses,
 )
 from topoloc.recordings.ros_calibration import RosCalibration as RosCalibration

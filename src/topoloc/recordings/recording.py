@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -180,6 +180,46 @@ def read_left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
         frame = read_left_frame(sequence.base, sequence.indices[index])
         return replace(frame, world_from_cam=sequence.poses[index])
     return getattr(sequence, "read_left_frame", sequence.__getitem__)(index)
+
+
+def keep_frames(sequence: StereoSequence) -> StereoSequence:
+    """Return the recording, which then keeps its first frames that are read in memory (256 MB).
+    Checks, SLAM and mapping read the same images, and decoding takes a sixth of their time."""
+    one = sequence
+    while isinstance(one, SequenceView):
+        if isinstance(one, _KeepingView):
+            return sequence
+        one = one.base
+    apart = tuple(getattr(sequence, "apart", ()))
+    return _KeepingView(sequence, list(range(len(sequence))), list(sequence.poses), apart)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _KeepingView(SequenceView):
+    _kept: dict[int, StereoFrame] = field(init=False, default_factory=dict)
+    _kept_bytes: list[int] = field(init=False, default_factory=list)
+
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one frame, or return the kept one. Raises as the base sequence."""
+        if row in self._kept:
+            return self._kept[row]
+        frame = super().read_frame(row)
+        depth = None if frame.depth is None else frame.depth.depth
+        num_bytes = sum(one.nbytes for one in (frame.image, frame.right, depth) if one is not None)
+        if self._has_room(num_bytes):
+            self._kept[row] = frame
+            self._kept_bytes.append(num_bytes)
+        return frame
+
+    def read_left_frame(self, index: int) -> StereoFrame:
+        """Read one frame without its right or depth image. Raises as `read_frame`."""
+        if index in self._kept or self._has_room(max(self._kept_bytes, default=0)):
+            return replace(self.read_frame(index), right=None, depth=None)
+        frame = read_left_frame(self.base, self.indices[index])
+        return replace(frame, world_from_cam=self.poses[index])
+
+    def _has_room(self, num_bytes: int) -> bool:
+        return sum(self._kept_bytes) + num_bytes <= 256_000_000
 
 
 def recording_notes(sequence: StereoSequence) -> list[str]:

@@ -44,12 +44,11 @@ def find_links(
     if len(places) < 2:
         return []
     proposals = _propose_pairs(keyframes, places)
-    links: list[Link] = []
-    found = parallel_map(lambda pair: match_keyframes(pair[1], pair[0], keyframes), proposals)
-    for done, link in enumerate(found, 1):
-        if link is not None:
-            links.append(link)
-        progress("loops", done, len(proposals))
+    of_pair: dict[tuple[int, int], Link | None] = {}
+    for pair, link in _match_pairs(proposals, keyframes):
+        of_pair[pair] = link
+        progress("loops", len(of_pair), len(proposals))
+    links = [link for link in of_pair.values() if link is not None]
     rank = {keyframe: place for place, keyframe in enumerate(places)}
 
     def select_supported(links: list[Link]) -> list[Link]:
@@ -70,10 +69,24 @@ def find_links(
             if not any(_is_contradicting(other, link, keyframes) for other in plausible)
         ]
     )
-    has_rivals = parallel_map(lambda link: _has_rival(link, keyframes, places), supported)
+    pairs = {link: _rival_pairs(link, keyframes, places) for link in supported}
+    unknown = {pair for of_link in pairs.values() for pair in of_link} - of_pair.keys()
+    of_pair |= dict(_match_pairs(sorted(unknown), keyframes))
     return select_supported(
-        [link for link, has_rival in zip(supported, has_rivals, strict=True) if not has_rival]
+        [
+            link
+            for link in supported
+            if not any(_is_rival(of_pair[pair], link, keyframes) for pair in pairs[link])
+        ]
     )
+
+
+def _match_pairs(
+    pairs: Sequence[tuple[int, int]], keyframes: Sequence[KeyFrame]
+) -> Iterator[tuple[tuple[int, int], Link | None]]:
+    """Generate each pair (target, source) with its link."""
+    found = parallel_map(lambda pair: match_keyframes(pair[1], pair[0], keyframes), pairs)
+    return zip(pairs, found, strict=True)
 
 
 def _propose_pairs(keyframes: Sequence[KeyFrame], places: list[int]) -> list[tuple[int, int]]:
@@ -226,23 +239,28 @@ def _is_contradicting(other: Link, link: Link, keyframes: Sequence[KeyFrame]) ->
     return _are_consistent(other, link, keyframes, drift) is False
 
 
-def _has_rival(link: Link, keyframes: Sequence[KeyFrame], places: list[int]) -> bool:
-    """Return whether the target also matches a neighbour of the source, at another relative
-    pose."""
+def _rival_pairs(
+    link: Link, keyframes: Sequence[KeyFrame], places: list[int]
+) -> list[tuple[int, int]]:
+    """Return the pairs (target, source) of a link's target and the neighbours of its source."""
     rival_places = 15  # before and after the link's own that are searched for contradicting links
     at = places.index(link.source)
     around = places[max(at - rival_places, 0) : at + rival_places + 1]
     submap = keyframes[link.source].submap
-    rivals = (
-        match_keyframes(source, link.target, keyframes)
+    return [
+        (link.target, source)
         for source in around
         if source not in (link.source, link.target) and keyframes[source].submap == submap
-    )
-    return any(
+    ]
+
+
+def _is_rival(rival: Link | None, link: Link, keyframes: Sequence[KeyFrame]) -> bool:
+    """Return whether the target also matches a neighbour of the source, at another relative
+    pose."""
+    return (
         rival is not None
         and _is_within_drift(rival, keyframes)
         and _is_contradicting(rival, link, keyframes)
-        for rival in rivals
     )
 
 

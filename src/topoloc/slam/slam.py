@@ -30,7 +30,7 @@ from topoloc.json_data import OneLine
 from topoloc.points.metric_points import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.recordings.recording import with_poses
+from topoloc.recordings.recording import keep_frames, with_poses
 from topoloc.slam.bundle.bundle_adjustment import adjust_bundle
 from topoloc.slam.calibration_checks import find_image_faults
 from topoloc.slam.input_checks import check_stereo
@@ -277,7 +277,8 @@ def run_slam(
         UnreadableImageError: an image cannot be read.
     """
     progress = progress or (lambda stage, done, total: None)
-    sequences = [sequences] if isinstance(sequences, StereoSequence) else list(sequences)
+    several = [sequences] if isinstance(sequences, StereoSequence) else sequences
+    sequences = [keep_frames(one) for one in several]
     keyframes: list[KeyFrame] = []
     landmarks = Landmarks()
     tracked: list[list[FramePose | None]] = []

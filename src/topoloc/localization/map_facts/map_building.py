@@ -28,7 +28,7 @@ from topoloc.node_ids import NodeId
 from topoloc.recordings.depth_range import leave_out_stuck_depth
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import leave_out_damaged
+from topoloc.recordings.recording import keep_frames, leave_out_damaged
 from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.input_checks import check_pose_coverage, check_stereo
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view
@@ -77,6 +77,7 @@ def build_map(
     warn = warn or warnings.warn
     opened = [open_sequence(one) if isinstance(one, str | Path) else one for one in several]
     sequences = [leave_out_stuck_depth(leave_out_damaged(one, warn), warn) for one in opened]
+    sequences = [keep_frames(one) for one in sequences]
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
         sequences = run_slam(sequences, progress, warn).apply(sequences)
         poses_from = ["slam"] * len(sequences)

@@ -32,7 +32,7 @@ from topoloc import (
 )
 from topoloc.apps.cli.output import UsageError, describe_recording, open_recording, print_line
 from topoloc.apps.cluster.remote import Progress
-from topoloc.apps.core_names import has_scale, scale_poses, split_selection
+from topoloc.apps.core_names import has_scale, keep_frames, scale_poses, split_selection
 from topoloc.apps.formats.colmap import estimate_metric_scale
 
 MIN_OVERLAP = 3
@@ -137,7 +137,9 @@ class MapJob:
         """Return the recordings with their poses and the sources of these. With `slam` the poses
         are computed later."""
         sequences = [
-            open_recording(path, self.format, self.camera, self.topics, self.images, True)
+            keep_frames(
+                open_recording(path, self.format, self.camera, self.topics, self.images, True)
+            )
             for path in self.recordings
         ]
         if tell is not None:
