@@ -67,6 +67,7 @@ OST_HEAD = "# oST version 5.0 parameters\n\n\n[image]\n\nwidth\n64\n\nheight\n48
         ),
         (OST_HEAD + ost("narrow_stereo", "0 0 0 0 0"), PINHOLE),
         (OST_HEAD + ost("head/left", " ".join(map(str, BENDS))), DISTORTED),
+        ("1 PINHOLE 64 48 40 41 32 24\n2 EQUIRECTANGULAR 8 4 8 4", PINHOLE),
         ("40 0 31.5\n0 41 23.5\n0 0 1\n", PINHOLE),
         ("40.0, 0.0, 31.5, 0.0, 41.0, 23.5, 0.0, 0.0, 1.0", PINHOLE),
         (f"K = {np.array(K)}", PINHOLE),
@@ -113,7 +114,7 @@ def test_yaml_under_another_name(read: Read):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ("1 FOV 64 48 40 41 32 24 0.9\n", "unknown camera model 'FOV'"),
+        ("1 EQUIRECTANGULAR 64 48 64 48\n", "model 'EQUIRECTANGULAR'; undistort the images"),
         (
             "1 PINHOLE 60 48 40 41 30 24\n2 PINHOLE 60 48 40 42 30 24",
             "2 cameras of COLMAP .*; keep",

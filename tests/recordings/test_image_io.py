@@ -248,6 +248,26 @@ def test_depth_in_metres_unknown_is_nan(tmp_path: Path):
     np.testing.assert_allclose(depth, [[np.nan, np.nan, 1.0], [0.5, 0.0002, 13.1068]], rtol=1e-6)
 
 
+@pytest.mark.parametrize("suffix", [".tiff", ".npy"])
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32])
+def test_depth_of_32_bits_does_not_wrap(tmp_path: Path, suffix: str, dtype: type):
+    units = np.array([[0, 65535, 70000], [20000, 2**32 - 1, 131072]], np.int64).astype(dtype)
+    path = tmp_path / f"depth{suffix}"
+    if suffix == ".npy":
+        np.save(path, units)
+    else:
+        Pillow.fromarray(units.view(np.int32)).save(path)
+    depth = read_depth_image(path, 10_000.0)
+    np.testing.assert_allclose(depth, [[np.nan, 6.5535, 7.0], [2.0, np.nan, 13.1072]], rtol=1e-6)
+
+
+def test_the_unknown_depth_of_16_bits_in_an_array_of_more(tmp_path: Path):
+    for dtype in (np.uint16, np.int32):
+        np.save(tmp_path / "depth.npy", np.array([[1500, 65535]], dtype))
+        depth = read_depth_image(tmp_path / "depth.npy", 1000.0)
+        np.testing.assert_allclose(depth, [[1.5, np.nan]])
+
+
 def test_depth_of_eight_bits_is_refused(tmp_path: Path):
     with pytest.raises(UnreadableImageError, match="16 bits"):
         read_depth(write(tmp_path / "d.png", picture(0)), 1000.0)

@@ -74,7 +74,8 @@ class Camera(OneLine):
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise CalibrationError(
-                f"unknown camera model {self.model!r}; known: {', '.join(MODELS)}"
+                f"unknown camera model {self.model!r}; undistort the images, or calibrate as one of"
+                f" {', '.join(MODELS)}"
             )
         names = MODELS[self.model]
         if len(self.params) != len(names):
@@ -264,12 +265,19 @@ class Camera(OneLine):
 
     @staticmethod
     def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
-        """Return the camera of one entry of COLMAP's cameras file. Inverse of `to_colmap`.
+        """Return the camera of one entry of COLMAP's cameras file. Inverse of `to_colmap`. A model
+        that is not in `model_names` is replaced by one that gives its pixels to 0.1 px.
 
         Raises:
-            CalibrationError: the model is unknown or the parameters are not usable.
+            CalibrationError: the model is unknown, none is that near, or the parameters are not
+                usable.
         """
-        camera = Camera(model, width, height, tuple(float(value) for value in params))
+        params = tuple(map(float, params))
+        if model not in MODELS:
+            from topoloc.geometry.fitted_models import fit_known_model  # loads an optimizer
+
+            model, params = fit_known_model(model, width, height, params)
+        camera = Camera(model, width, height, params)
         return replace(camera, params=camera._shift_principal_point(-0.5))
 
     def _shift_principal_point(self, offset_px: float) -> tuple[float, ...]:

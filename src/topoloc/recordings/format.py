@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from warnings import warn
@@ -16,6 +17,9 @@ from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import IMAGE_SUFFIXES
 from topoloc.recordings.text_files import parse_times, read_rows
 from topoloc.recordings.trajectory import Trajectory, has_answers
+
+_DATE = re.compile(r"(?<!\d)(\d{9,10})\.(\d{1,9})(?=\.\D)")
+_FIRST_DATE_NS, _LAST_DATE_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # 2000 to 2100
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,9 @@ def list_images(folder: Path, suffix: str = "") -> list[Path]:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that compares numbers inside names as numbers of any length."""
+    """Return a sort key that compares numbers inside names as numbers of any length. The decimals
+    of a date in seconds are compared as such."""
+    name = _DATE.sub(lambda date: f"{date[1]}.{date[2]:0<9}", name)
     return [
         (len(number := part.lstrip("0")), number) if part.isdigit() else (-1, part)
         for part in re.split(r"([0-9]+)", name)
@@ -145,6 +151,21 @@ def match_times(
 def times_from_rate(num_frames: int, rate_hz: int = 10) -> list[int]:
     """Return times in nanoseconds at a constant rate, starting at 0."""
     return [index * 1_000_000_000 // rate_hz for index in range(num_frames)]
+
+
+def times_from_names(paths: Sequence[Path]) -> list[int] | None:
+    """Return the times (nanoseconds) that the names of images are: seconds with equally many
+    decimals, or dates in any unit. Return None if they are no increasing times."""
+    rows = [(0, [path.stem]) for path in paths]
+    if not all(re.fullmatch(r"\d{1,19}(\.\d{1,9})?", stem) for _, (stem,) in rows):
+        return None
+    with suppress(RecordingError):
+        t_ns = parse_times(rows, paths[0], RecordingError)
+        num_decimals = {len(stem.partition(".")[2]) for _, (stem,) in rows}
+        are_dates = _FIRST_DATE_NS <= t_ns[0] <= t_ns[-1] < _LAST_DATE_NS
+        if are_dates or (len(num_decimals) == 1 and 0 not in num_decimals):
+            return t_ns
+    return None
 
 
 def count_times(path: Path) -> int | None:

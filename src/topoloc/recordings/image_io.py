@@ -132,8 +132,8 @@ def _white_level(values: UInt16[np.ndarray, "h w"]) -> int:
 
 
 def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
-    """Read a depth image of 16 bits or of floats (TIFF) in metres. Unknown depth is NaN (0 in the
-    file, and 65535 of 16 bits).
+    """Read a depth image of 16 or 32 bits, or of floats (TIFF), in metres. Unknown depth is NaN (0
+    in the file, and 65535 of 16 bits).
 
     Raises:
         UnreadableImageError: as `read_image`, or the image is not one such channel.
@@ -143,11 +143,20 @@ def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.
             raise UnreadableImageError(
                 f"{path}: depth must be one channel of 16 bits, not pixels of {picture.mode}"
             )
-        is_float = picture.mode == "F"
-        units = np.array(picture).astype(np.float32 if is_float else np.uint16)
-    depth = units.astype(np.float32) / np.float32(units_per_metre)
-    depth[~((units > 0) & np.isfinite(units)) | (units == 65535) & (not is_float)] = np.nan
-    return depth
+        units = np.array(picture).astype(np.float32 if picture.mode == "F" else np.int32)
+    return _to_metres(units, units_per_metre)
+
+
+def _to_metres(units: np.ndarray, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
+    """Return depth in metres, NaN if unknown. The largest number of 16 bits means unknown, or that
+    of more bits if they hold larger ones."""
+    is_known = np.isfinite(units) & (units > 0)
+    if units.dtype.kind != "f":
+        is_known &= units != (65535 if units.max(initial=0) <= 65535 else np.iinfo(units.dtype).max)
+    with np.errstate(over="ignore", invalid="ignore"):
+        metres = units.astype(np.float32) / np.float32(units_per_metre)
+    metres[~is_known] = np.nan
+    return metres
 
 
 def image_size(path: Path | EncodedImage, as_stored: bool = False) -> tuple[int, int]:
@@ -306,9 +315,7 @@ def read_depth_image(path: Path, units_per_metre: float) -> Float32[np.ndarray, 
     path, suffix = find_path(path), path.suffix.lower()
     if suffix in (".exr", ".npy"):
         units = _read_exr(path) if suffix == ".exr" else _read_npy(path)
-        with np.errstate(invalid="ignore", over="ignore"):
-            is_known = np.isfinite(units) & (units > 0.0)
-            depth = np.where(is_known, units / units_per_metre, np.nan).astype(np.float32)
+        depth = _to_metres(units, units_per_metre)
     else:
         depth = read_depth(path, units_per_metre)
     if problem := find_depth_problem(depth):
@@ -353,7 +360,7 @@ def _read_npy(path: Path) -> np.ndarray:
         ) from None
     if not is_depth:
         raise UnreadableImageError(f"{path}: no array of depth, which is height x width numbers")
-    return np.array(units, dtype=np.float64).reshape(units.shape[:2])
+    return np.array(units).reshape(units.shape[:2])
 
 
 def _read_exr(path: Path) -> np.ndarray:

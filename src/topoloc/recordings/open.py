@@ -24,6 +24,8 @@ FORMATS = {
     "euroc": "topoloc.recordings.formats.euroc:FORMAT",
     "tum": "topoloc.recordings.formats.tum:FORMAT",
     "seven_scenes": "topoloc.recordings.formats.seven_scenes:FORMAT",
+    "scannet": "topoloc.recordings.formats.scannet:FORMAT",
+    "arkitscenes": "topoloc.recordings.formats.arkitscenes:FORMAT",
     "nerfstudio": "topoloc.apps.formats.nerfstudio:FORMAT",
     "stray_scanner": "topoloc.apps.formats.stray_scanner:FORMAT",
     "record3d": "topoloc.apps.formats.record3d:FORMAT",

@@ -38,6 +38,7 @@ from topoloc.recordings.text_files import (
     parse_uniform_times,
     read_numeric_table,
     read_rows,
+    read_text,
 )
 
 # tolerance for times written with few decimals
@@ -136,6 +137,18 @@ class Trajectory:
         these poses, so that they are nobody's ground truth (`has_answers`). Raises TrajectoryError
         if the trajectory has no times, and TopolocError if the file cannot be written."""
         write_text(path, f"{_ANSWERS_HEADER}\n" * are_answers + self.to_tum())
+
+
+def read_pose_matrix(path: Path) -> Rigid3 | None:
+    """Read the 4x4 matrix of one pose (metres). None if it is lost, with infinite numbers. Raises
+    TrajectoryError: the file holds other numbers, or no pose."""
+    try:
+        numbers = np.array(read_text(path, TrajectoryError).split(), dtype=np.float64)
+        matrix = numbers.reshape(4, 4)
+    except ValueError:
+        raise TrajectoryError(f"{path}: not a matrix of 4x4 numbers") from None
+    with TrajectoryError.at(path):
+        return None if np.isinf(matrix).any() else Rigid3.from_matrix(matrix)
 
 
 def has_answers(path: Path) -> bool:

@@ -22,7 +22,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import camera_from_intrinsics
 from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.depth_checks import find_depth_shift, find_late_depth
-from topoloc.slam.input_checks import add_calibration
+from topoloc.slam.input_checks import add_calibration, find_left_out_lens
 from topoloc.slam.measured_steps import MatchedPoints, MeasuredStep, measure_steps
 from topoloc.slam.still_part import find_still_part
 
@@ -60,9 +60,9 @@ def find_image_faults(sequence: StereoSequence) -> list[str]:
     is_single = sequence[0].right is None and sequence[0].depth is None
     steps = [] if is_single else measure_steps(sequence, list(range(len(sequence))))
     notes = [find_still_part(sequence), find_depth_shift(sequence), find_late_depth(sequence)]
-    notes.append(_find_ray_depth(sequence, steps))
-    if notes[-1] is None:  # it looks like another focal length, too
-        notes.append(_find_focal_problem(sequence, steps))
+    bent = find_left_out_lens(sequence) or _find_ray_depth(sequence, steps)
+    # both look like another focal length, too
+    notes.append(bent or _find_focal_problem(sequence, steps))
     if (camera := sequence[0].camera) is not None:
         try:
             camera_from_intrinsics(*camera.intrinsics, camera.width, camera.height)

@@ -221,9 +221,31 @@ def test_names_that_lead_out_of_the_folder(model: Make, name: str):
         open_sequence(model(names=(name, "b.png")))
 
 
-def test_an_unknown_camera_model_is_refused(model: Make):
-    with pytest.raises(CalibrationError, match="unknown camera model 'FOV'"):
-        open_sequence(model(model="FOV", params=[40.0, 41.0, 16.0, 12.0, 0.5]))
+@pytest.mark.parametrize("binary", [True, False], ids=["binary", "text"])
+def test_a_camera_of_another_model_is_fitted(model: Make, binary: bool):
+    found = open_sequence(model(binary, model="FOV", params=[20.0, 21.0, 16.0, 12.0, 0.9])).camera
+    points = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 1.0]])
+    radii = np.linalg.norm(points[:, :2], axis=1, keepdims=True)
+    bent = points[:, :2] * np.arctan(2.0 * radii * np.tan(0.45)) / (0.9 * radii)
+    expected = bent * [20.0, 21.0] + [15.5, 11.5]
+    np.testing.assert_allclose(found.img_from_cam(points), expected, atol=0.05)
+
+
+EQUIRECTANGULAR = {"model": "EQUIRECTANGULAR", "params": [float(WIDTH), float(HEIGHT)]}
+
+
+def test_an_unknown_camera_model_is_refused_if_an_image_uses_it(model: Make):
+    with pytest.raises(CalibrationError, match="unknown camera model 'EQUIRECTANGULAR'; undistort"):
+        open_sequence(model(**EQUIRECTANGULAR))
+
+
+def test_an_unknown_camera_model_without_images_is_no_error(model: Make):
+    root = model()
+    found = pycolmap.Reconstruction(str(root / "sparse" / "0"))
+    other = pycolmap.Camera(camera_id=7, width=WIDTH, height=HEIGHT, **EQUIRECTANGULAR)
+    found.add_camera_with_trivial_rig(other)
+    found.write_binary(root / "sparse" / "0")
+    assert len(open_sequence(root)) == 3
 
 
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])

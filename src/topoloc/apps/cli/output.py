@@ -41,8 +41,9 @@ Format = Annotated[
     option(
         "NAME",
         "recognised",
-        help="Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio,"
-        " stray_scanner, record3d, colmap, colmap_database, rosbag, mcap, zed, video or folder.",
+        help="Format of the recordings: kitti, euroc, tum, seven_scenes, scannet,"
+        " arkitscenes, nerfstudio, stray_scanner, record3d, colmap, colmap_database, rosbag, mcap,"
+        " zed, video or folder.",
     ),
 ]
 CameraOption = Annotated[
@@ -258,10 +259,22 @@ def print_recordings(
     rows += [
         (name, "", _error(metres, degrees), "", "", "", "") for name, metres, degrees in published
     ]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+    print_table(rows)
+
+
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of cells in columns: the first to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for name, *cells in rows:
         padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
         print_line("  ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
+
+
+def print_quarters(quarters: Sequence[Any]) -> None:
+    """Print `Evaluation.quarters` or those of a certificate as a table below other facts."""
+    if quarters:
+        print()
+        print_table([quarters[0].COLUMNS, *(one.cells() for one in quarters)])
 
 
 def _row(recording: dict[str, Any]) -> tuple[str, ...]:

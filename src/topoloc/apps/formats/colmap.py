@@ -69,7 +69,8 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
     if not posed:
         raise RecordingError(f"{model}: no image of this model has a pose")
     names = [parse_relative_path(image.name, str(model), RecordingError) for image in posed]
-    cameras = {number: _camera(camera, model) for number, camera in read.cameras.items()}
+    used = {image.camera_id for image in posed}
+    cameras = {number: _camera(read.cameras[number], model) for number in used}
     of_images = [cameras[image.camera_id] for image in posed]
     poses: list[Rigid3 | None] = [_world_from_cam(image, model) for image in posed]
     name, t_ns = path.resolve().name, times_from_names(names)

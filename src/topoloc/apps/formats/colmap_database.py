@@ -35,6 +35,8 @@ _CAMERA_MODELS = [
     "DIVISION",
     "SIMPLE_FISHEYE",
     "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
 ]
 """COLMAP's camera models by their numbers."""
 _MAX_PARAMS, _MAX_ROWS = 64, 10_000_000
@@ -59,23 +61,25 @@ def open_colmap_database(path: Path, images: Path | None = None) -> Recording:
     if not root.is_dir():
         fault = "the images of this database are missing; use --images FOLDER"
         raise RecordingError(f"{path}: {fault}")
-    cameras, camera_id_by_image = _read_database(file)
+    rows, camera_id_by_image = _read_database(file)
     if not camera_id_by_image:
         raise RecordingError(f"{file}: no image in this database")
     names = sorted(
         (parse_relative_path(name, str(file), RecordingError) for name in camera_id_by_image),
         key=natural_key,
     )
-    if missing := next((name for name in names if camera_id_by_image[name] not in cameras), None):
+    if missing := next((name for name in names if camera_id_by_image[name] not in rows), None):
         raise RecordingError(f"{file}: damaged, the camera of {missing} is missing")
+    used = {camera_id_by_image[name] for name in names}
+    cameras = {number: _camera(rows[number], file) for number in used}
     of_frames = [cameras[camera_id_by_image[name]] for name in names]
     poses: list[Rigid3 | None] = [None] * len(names)
     name, t_ns = file.resolve().parent.name, colmap.times_from_names(names)
     return Recording.with_cameras(name, root, names, t_ns, poses, of_frames, as_stored=True)
 
 
-def _read_database(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
-    """Return the cameras by number, and the number of the camera of each image by its name."""
+def _read_database(file: Path) -> tuple[dict[int, tuple[Any, ...]], dict[str, int]]:
+    """Return the rows of cameras by number, and the camera number of each image by its name."""
     try:
         uri = f"{file.resolve().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:
@@ -92,7 +96,7 @@ def _read_database(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
         raise RecordingError(f"{file}: no database of COLMAP, or damaged ({reason})") from None
     if not all(isinstance(name, str) and isinstance(number, int) for name, number in images):
         raise RecordingError(f"{file}: damaged, an image without a name or a camera")
-    return {row[0]: _camera(row, file) for row in cameras}, dict(images)
+    return {row[0]: row for row in cameras}, dict(images)
 
 
 def _camera(row: tuple[Any, ...], file: Path) -> Camera:

@@ -4,14 +4,16 @@ Stereo: ``left/ right/``, ``image_0/ image_1/`` or ``cam0/ cam1/``. It needs a `
 a "baseline" (m) or two cameras, or YAML of OpenCV or Kalibr. RGB-D: ``rgb/`` or ``color/``,
 ``depth/`` registered to it, and a "depth_factor" (units per metre). Otherwise the images are in the
 folder itself or in ``rgb/``, ``color/``, ``left/``, ``image_0/``, ``cam0/`` or ``images/``.
-``times.txt``, ``truth.tum`` and ``poses.txt`` (KITTI rows) are optional.
+``times.txt``, ``truth.tum`` and ``poses.txt`` (KITTI rows) are optional. Names that are times, such
+as ``1305031452.791720.png``, are used as such.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
-from topoloc.errors import CalibrationError, RecordingError
+from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import (
     CalibrationForSize,
@@ -28,6 +30,7 @@ from topoloc.recordings.format import (
     list_images,
     read_ground_truth,
     read_times,
+    times_from_names,
 )
 from topoloc.recordings.image_io import IMAGE_SUFFIXES
 from topoloc.recordings.recording import DepthImages, Recording, RightImages
@@ -106,11 +109,24 @@ def _make_recording(
     right: RightImages | None = None,
     depth: DepthImages | None = None,
 ) -> Recording:
-    t_ns = read_times(path / "times.txt", len(images))
-    poses = read_ground_truth(path / "truth.tum", [path / "poses.txt"], t_ns)
+    t_ns, poses = _find_times(path, images)
     names = [file.relative_to(path).as_posix() for file in images]
     camera = calibration and calibration.camera
     return Recording(path.resolve().name, path, names, t_ns, poses, camera, right, depth)
+
+
+def _find_times(path: Path, images: list[Path]) -> tuple[list[int], list[Rigid3 | None]]:
+    """Return the times and poses of the frames. The names of the images are their times if there is
+    no other list of them, and they fit the ground truth."""
+    t_ns = read_times(path / "times.txt", len(images))
+    truth = path / "truth.tum", [path / "poses.txt"]
+    named = None if (path / "times.txt").is_file() else times_from_names(images)
+    try:
+        return named or t_ns, read_ground_truth(*truth, named or t_ns)
+    except TrajectoryError:
+        with suppress(TrajectoryError):
+            return t_ns, read_ground_truth(*truth, t_ns)
+        raise
 
 
 def _has_images(folder: Path) -> bool:

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.errors import RecordingError, TrajectoryError
+from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.format import RecordingFormat, list_images, natural_key
 from topoloc.recordings.recording import DepthImages, Recording
+from topoloc.recordings.trajectory import read_pose_matrix
 
 EXPECTED_FILES = "frame-*.color.png or .jpg with .pose.txt, or one seq-* folder of these"
 DEPTH_CAMERA = Camera.pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
@@ -85,15 +86,10 @@ def _frame_number(path: Path) -> int:
     return int(number[1])
 
 
-def _read_pose(path: Path) -> Rigid3:
+def _read_pose(path: Path) -> Rigid3 | None:
     """Read world_from_cam of the colour camera of one frame."""
-    try:
-        numbers = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64)
-        matrix = numbers.reshape(4, 4)
-    except ValueError:
-        raise TrajectoryError(f"{path}: not a matrix of 4x4 numbers") from None
-    with TrajectoryError.at(path):
-        return Rigid3.from_matrix(matrix) @ COLOUR_FROM_DEPTH.inverse()
+    world_from_depth = read_pose_matrix(path)
+    return world_from_depth and world_from_depth @ COLOUR_FROM_DEPTH.inverse()
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_seven_scenes)

@@ -91,6 +91,31 @@ def test_depth_that_does_not_tell_its_order_has_the_named_one(
     assert recording_notes(sequence) == []
 
 
+@pytest.mark.parametrize(
+    ("scale", "decimals", "unit"),
+    [
+        (1000.0, 0, 1000.0),  # 16UC1, converted
+        (1000.0, 6, 1000.0),
+        (1.0, 6, 1.0),
+        (100.0, 6, 1.0),  # of a drone above
+        (1.0, 0, 1.0),
+    ],
+)
+def test_float_depth_in_millimetres_is_told(
+    scale: float, decimals: int, unit: float, tmp_path: Path
+):
+    metres = [depth_of(k) for k in range(4)]
+    if scale == 100.0:
+        metres[1][:] = 655.34  # of the sky
+    stored = [(scale * one).round(decimals).astype("<f4") for one in metres]
+    sequence = open_sequence(write_rgbd(tmp_path, "ros2", stored, "32FC1", 0))
+    for row, one in enumerate(stored):
+        expected = np.where(one > 0, one / unit, np.nan)
+        np.testing.assert_allclose(sequence[row].depth.depth, expected, rtol=1e-6)
+    notes = recording_notes(sequence)
+    assert ["is read in millimetres" in note for note in notes] == [True] * (unit == 1000.0)
+
+
 @pytest.mark.parametrize("flag", [0, 1])
 @pytest.mark.parametrize("factor", [4, 16, 64, 200, 255.996, 257])
 def test_pairs_of_16_bits(factor: float, flag: int, walk: StereoSequence, tmp_path: Path):

@@ -99,6 +99,22 @@ def decode_depth(message: Any, name: str, is_reversed: bool = False) -> Float32[
     return depth
 
 
+def are_millimetres(depth: Float32[np.ndarray, " n"]) -> bool:
+    """Return whether float depth that should be in metres is in millimetres: no camera measures
+    hundreds of metres in whole metres, or has nothing nearer than 100 m and most beyond 1 km.
+
+    Args:
+        depth: known depth of several images. The largest value may be that of the sky.
+    """
+    max_metres, max_far, max_millimetres, min_whole = 100.0, 1e3, 1e5, 0.99
+    depth = depth[depth < depth.max(initial=0.0)]
+    if not len(depth):
+        return False
+    near, median = np.quantile(depth, [0.05, 0.5])
+    is_whole = np.mean(depth == np.rint(depth)) > min_whole and median > max_metres
+    return bool(median < max_millimetres and (is_whole or (median > max_far and near > max_metres)))
+
+
 def _decode_compressed_depth(message: Any, name: str) -> Float32[np.ndarray, "h w"]:
     data = _message_bytes(message, name)
     if "compressedDepth" not in message.format:

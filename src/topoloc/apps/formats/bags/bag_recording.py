@@ -10,6 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from topoloc import (
     CalibrationError,
     Camera,
@@ -39,7 +41,12 @@ from topoloc.apps.formats.bags.bag_calibration import (
     read_camera_info,
 )
 from topoloc.apps.formats.bags.bag_clock import Clock
-from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image, image_file
+from topoloc.apps.formats.bags.bag_images import (
+    are_millimetres,
+    decode_depth,
+    decode_image,
+    image_file,
+)
 from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
 from topoloc.apps.formats.bags.messages import decode, frame_id, header_stamp_ns, num_header_bytes
 from topoloc.apps.formats.bags.pixel_order import has_reversed_bytes
@@ -59,12 +66,13 @@ MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
 @dataclass(frozen=True, eq=False)
 class ImageMessages:
     """Hold the messages of a topic of images, one for each frame. `is_reversed`: their pixels have
-    the other order of bytes than they say."""
+    the other order of bytes than they say. `depth_unit`: that of decoded depth, metres."""
 
     topic: Topic
     refs: list[MessageRef]
     is_stamped: bool = True
     is_reversed: bool = False
+    depth_unit: float = 1.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,7 +129,7 @@ class BagRecording(IndexedFrames):
         if self.depth is not None:
             images, camera, cam_from_depth = self.depth
             message, name = self._read_message(images, row)
-            depth = decode_depth(message, name, images.is_reversed)
+            depth = decode_depth(message, name, images.is_reversed) * np.float32(images.depth_unit)
             if camera == self.camera:  # registered, and may be coarser
                 return replace(frame, depth=depth_image_of(name, depth, camera, cam_from_depth))
             _check_size(name, depth.shape, camera)
@@ -197,6 +205,7 @@ def _open_recording(bag: Bag, roles: Roles, given: CameraCalibration | None) -> 
         t_ns, left, images = _match_by_time(bag, (t_ns, left), roles.depth, MAX_DEPTH_DELAY_MS)
         is_replaced = given is not None and is_registered(roles.depth)
         depth_info = None if is_replaced else roles.depth_info
+        images = replace(images, depth_unit=_find_depth_unit(bag, images))
         depth = (images, *find_depth_camera(bag, roles.depth, depth_info, camera, frame, tree))
     poses = camera_poses(bag, roles, frame, tree, t_ns)
     return BagRecording(bag.path.resolve().name, bag, t_ns, poses, camera, left, right, depth)
@@ -265,6 +274,24 @@ def _match_by_time(
     matched = replace(left, refs=[left.refs[row] for row, _ in pairs])
     partners = replace(images, refs=[images.refs[row] for _, row in pairs])
     return [t_ns[row] for row, _ in pairs], matched, partners
+
+
+def _find_depth_unit(bag: Bag, images: ImageMessages) -> float:
+    """Return the unit of decoded depth in metres. A note tells of float depth in millimetres."""
+    samples = [np.zeros(0, np.float32)]
+    for ref in images.refs[:: -(-len(images.refs) // 5)]:
+        with suppress(RecordingError):
+            message = decode(images.topic, bag.read(ref))
+            if "32FC1" in getattr(message, "encoding", getattr(message, "format", "")):
+                depth = decode_depth(message, images.topic.name, images.is_reversed)
+                samples.append(depth[np.isfinite(depth)])
+    if not are_millimetres(np.concatenate(samples)):
+        return 1.0
+    bag.notes.append(
+        f"{bag.path}: depth of {images.topic.name} is read in millimetres: as metres, which 32FC1"
+        " should be, it would be that of no camera"
+    )
+    return 1e-3
 
 
 def _quarter_period_ms(t_ns: list[int]) -> int:
