@@ -4,7 +4,7 @@
         [--out-of-map SEQ ...] [--map-from-truth FILE]
 
 The map of MAP_SEQ is certified with the walks. Each unseen recording with truth is then localized,
-and its wrong independent pieces are counted at the certificate's threshold, beside the promise.
+and its wrong independent pieces are counted as the map gives its answers, beside the promise.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
         print(found.certificate.promise())
         for one in found.certificate.conditions:
             print(f"  {one.name}: {one.describe()}")
-        level = found.certificate.min_probability or 1.0
+        level = found.certificate.applied_min_probability
         localizer = topoloc.Localizer(path)
         for name in args.unseen:
             sequence = topoloc.open_sequence(name)

@@ -13,17 +13,21 @@ from msgspec import structs
 from scipy.stats import binom
 
 from built_room import unseen_views, write_pictures
+from hand_made import answer
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.evaluation.certification import certify, find_nodes_in_view
 from topoloc.evaluation.certified_answers import (
+    CertifiedAnswers,
     WorstAnswers,
+    derive_certificate,
     max_share,
     pieces_by_look,
     pieces_by_pose,
 )
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.prune import prune
-from topoloc.localization.localizer import Localizer
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map, undo_edit
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
@@ -67,6 +71,53 @@ def test_the_certificate_holds_on_new_results():
         assert threshold is not None
         num_broken += 0.2 * (1.0 - threshold) ** 2 > 0.02  # the true share of wrong pieces
     assert num_broken <= 65
+
+
+def _walk_with_wrong_answers_by_night() -> CertifiedAnswers:
+    """Return 300 right answers by day with p = 0.99, and 20 by night, of which 4 are wrong, with p
+    = 0.6. Each is independent."""
+    answers = []
+    for number in range(320):
+        is_dark, is_wrong = number >= 300, number >= 316
+        one = answer(str(number), 0.0, error_m=3.0 if is_wrong else 0.01, error_deg=0.0)
+        assert isinstance(one.result, Localization)
+        result = replace(one.result, probability=0.6 if is_dark else 0.99, times_ms={"total": 1.0})
+        light, angle = (3.0 if is_dark else 1.1), 5.0
+        answers.append(replace(one, result=result, light_ratio=light, angle_deg=angle))
+    return CertifiedAnswers("walk", "walk", True, answers, list(range(320)))
+
+
+@pytest.mark.parametrize("is_applied", [False, True])
+def test_answers_are_counted_as_the_map_gives_them(is_applied: bool):
+    walk = _walk_with_wrong_answers_by_night()
+    found = derive_certificate([walk], LocalizerConfig(), 0.02, is_applied)
+    of_walk = found.conditions[0]
+    num_given, num_wrong = (300, 0) if is_applied else (320, 4)
+    assert (of_walk.num_localized, of_walk.num_wrong) == (num_given, num_wrong)
+    assert found.max_wrong_share == pytest.approx(max_share(num_wrong, 320, 0.95))
+    assert found.threshold_wrong_share == pytest.approx(max_share(0, 320, 0.95))
+    assert sum(one.num_poses for one in found.quarters if one.by == "light") == num_given
+    assert ("at a probability of at least 0.6" in found.promise()) == is_applied
+    state = "0.6, applied; it refuses" if is_applied else "0.6, not applied (topoloc certify"
+    assert found.describe_threshold().startswith(state)
+    assert "5.1 % of the right answers" in found.describe_threshold()
+
+
+def test_a_group_does_not_hide_behind_the_others():
+    walk = _walk_with_wrong_answers_by_night()
+    groups = derive_certificate([walk], LocalizerConfig(), 0.02, False, ["light", "angle"]).groups
+    by_name = {one.name(): one for one in groups}
+    day, dusk, night = (
+        by_name[f"light {name}"] for name in ("1 to 1.25", "1.25 to 2", "2 or more")
+    )
+    assert (day.num_images, day.max_wrong_share) == (300, max_share(0, 300, 0.95))
+    assert (dusk.num_images, dusk.max_wrong_share) == (0, None)
+    assert (night.num_images, night.num_wrong) == (20, 4)
+    assert night.max_wrong_share == max_share(4, 20, 0.95)
+    assert night.threshold_wrong_share == max_share(0, 20, 0.95)
+    assert "at most 40 % wrong (n = 20)" in night.describe()
+    assert "a threshold of 0.6, not applied, makes it 14 %" in night.describe()
+    assert by_name["angle 0 to 10 deg"].num_wrong == 4
 
 
 def test_a_walk_that_comes_back_gives_no_new_pieces():

@@ -11,7 +11,8 @@ import pytest
 
 from hand_made import answer, elsewhere, lost
 from topoloc.apps.viewer.result_files import read_results
-from topoloc.evaluation.metrics import summarize
+from topoloc.evaluation.metrics import EvaluatedQuery, find_quarters, summarize
+from topoloc.localization.result import Localization
 
 ANSWERS = [
     answer("a", 0.0, error_m=0.01, error_deg=0.1),
@@ -66,6 +67,31 @@ def test_errors_are_compared_with_their_standard_deviations():
     assert np.isnan(lost("b", 0.0).error_over_sigma)
     inside, outside = (answer("c", 0.0, error_m=m, error_deg=0.0) for m in (0.0354, 0.0356))
     assert summarize([inside, exact, outside])["num_outside_ellipsoid"] == 1  # 3.548 sigmas
+
+
+def _posed(num_inliers: int, error_m: float = 0.0, **more: float) -> EvaluatedQuery:
+    """Return a pose with standard deviations of 1 cm each and half of this many percent as p."""
+    one = answer(str(num_inliers), 0.0, error_m=error_m, error_deg=0.0)
+    assert isinstance(one.result, Localization)
+    found = replace(one.result, num_inliers=num_inliers, probability=num_inliers / 200)
+    return replace(one, result=found, **more)
+
+
+def test_the_hardest_quarter_does_not_hide_behind_the_average():
+    easy = [_posed(100 + n, angle_deg=60.0 - n, light_ratio=1.0) for n in range(6)]
+    hard = [_posed(10, 0.3, angle_deg=1.0), _posed(20, 0.1, angle_deg=50.0)]
+    nowhere = [lost("f", 0.0), elsewhere("moon", accepted=True)]
+    quarters = find_quarters([*easy, *nowhere, *hard])
+    by_inliers, by_angle = quarters[:4], quarters[4:]
+    assert [one.by for one in quarters] == ["inliers"] * 4 + ["angle"] * 4  # six have a light
+    hardest = by_inliers[0]
+    assert (hardest.hardest, hardest.easiest, hardest.num_poses) == (10.0, 20.0, 2)
+    assert (hardest.num_right, hardest.num_inside) == (1, 0)
+    assert hardest.mean_probability == pytest.approx(0.075)
+    assert hardest.median_position_sigma_m == pytest.approx(0.01 * np.sqrt(3.0), rel=0.05)
+    assert all(one.num_right == one.num_inside == 2 for one in by_inliers[1:])
+    assert (by_angle[0].hardest, by_angle[-1].easiest) == (60.0, 1.0)
+    assert find_quarters(easy) == []  # too few to tell
 
 
 def test_poses_for_images_from_elsewhere_are_false_and_nothing_else_changes():

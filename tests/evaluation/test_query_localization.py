@@ -49,6 +49,18 @@ def test_the_nearest_node_is_that_of_eq_1(localizer: Localizer, views: Path):
     assert answer.nearest_node_id in np.argsort(distances)[:2]  # rotation counts as well
 
 
+def test_angle_and_light_are_those_to_the_nearest_mapped_frame(
+    localizer: Localizer, tmp_path: Path
+):
+    dark = [(image // 2, pose) for image, pose in unseen_views()[:3]]
+    sequence = open_sequence(write_pictures(tmp_path / "dark", dark))
+    turned = Rigid3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.radians(30.0)]))
+    plain, aside = (localize_queries(localizer, sequence, t) for t in (None, turned))
+    assert [one.light_ratio for one in plain] == pytest.approx([2.0] * 3, rel=0.05)
+    assert max(one.angle_deg for one in plain) < 2.0
+    assert [one.angle_deg for one in aside] == pytest.approx([30.0] * 3, abs=3.0)
+
+
 def test_truth_of_another_world_is_brought_into_the_maps(localizer: Localizer, views: Path):
     there = Rigid3.exp(np.array([5.0, -2.0, 1.0, 0.3, -0.2, 1.0]))
     plain = localize_queries(localizer, open_sequence(views))

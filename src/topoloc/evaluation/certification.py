@@ -26,7 +26,7 @@ from topoloc.json_data import OneLine
 from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import QueryImage
-from topoloc.mapping.certificate import Certificate
+from topoloc.mapping.certificate import Certificate, GroupKind
 from topoloc.mapping.config import Progress
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.topomap import TopoMetricMap
@@ -65,6 +65,7 @@ class Certification(OneLine):
         JSON."""
         return self.certificate.to_json() | {
             "promise": self.certificate.promise(),
+            "threshold": self.certificate.describe_threshold(),
             "blind_spots": [pose.to_json() for pose in self.blind_spots],
             "answers": [
                 answer.to_json() | {"condition": condition.name, "piece": piece}
@@ -84,6 +85,7 @@ def certify(
     config: LocalizerConfig | None = None,
     progress: Progress | None = None,
     on_wait: WaitCallback | None = None,
+    group_by: Sequence[GroupKind] = (),
 ) -> Certification:
     """Measure the answers of a map and store the certificate in its file.
 
@@ -96,6 +98,7 @@ def certify(
         config: settings of the localizer.
         progress: called with a name, images done and images in all.
         on_wait: called once before waiting for another edit of the map.
+        group_by: `angle`, `light`: also a promise for each group of the walks' images by these.
 
     Raises:
         MapError: the map cannot be read or written, or was edited meanwhile; nothing is stored.
@@ -113,7 +116,7 @@ def certify(
             answers = localize_out_of_map(localizer, recording, progress)
             pieces = find_pieces(topomap.config, answers, False)
             conditions.append(CertifiedAnswers(recording.name, "out_of_map", True, answers, pieces))
-    certificate = derive_certificate(conditions, config, max_wrong_share, is_applied)
+    certificate = derive_certificate(conditions, config, max_wrong_share, is_applied, group_by)
     with edit_map(path, on_wait) as edit:
         file = edit.topomap.file
         if measured is None or file is None or file.digest != measured.digest:

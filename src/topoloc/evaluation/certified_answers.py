@@ -13,30 +13,39 @@ pieces falls as the threshold rises, so the bound also holds for the chosen thre
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from itertools import groupby
+from itertools import compress, groupby, pairwise
 from math import exp, lgamma, log, log1p
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from topoloc.evaluation.metrics import EvaluatedQuery
+from topoloc.evaluation.metrics import EvaluatedQuery, find_quarters
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import encode_json
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.result import Localization
-from topoloc.mapping.certificate import Certificate, CertifiedCondition, ConditionKind
+from topoloc.mapping.certificate import (
+    Certificate,
+    CertifiedCondition,
+    CertifiedGroup,
+    ConditionKind,
+    GroupKind,
+)
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.storage.entries import today
 from topoloc.recordings.frame import to_grey
 
-MAX_TRANSLATION, MAX_ROTATION_DEG = 0.25, 2.0
-"""A pose further off than either (metres, degrees) is wrong: the probability is about these."""
 CONFIDENCE = 0.95
+GROUP_BOUNDS: dict[GroupKind, tuple[float, ...]] = {
+    "angle": (0.0, 10.0, 30.0, math.inf),
+    "light": (1.0, 1.25, 2.0, math.inf),
+}
+"""Bounds of the groups, fixed so that a promise is about the same images in each map."""
 _PIECE_D_THRESH = 5.0
 """Images further apart than this many D_thresh (Eq. 1) are independent: no node serves both."""
 _THUMBNAIL_PX = 32
@@ -124,12 +133,16 @@ class WorstAnswers:
         """Return how many pieces hold a wrong answer at a threshold of the probability."""
         return int(np.count_nonzero(self.worst >= min_probability))
 
+    def bound(self, min_probability: float, confidence: float) -> float:
+        """Return the upper bound of the share of wrong pieces at a threshold."""
+        return max_share(self.num_wrong(min_probability), len(self.worst), confidence)
+
     def find_threshold(self, lowest: float, limit: float, confidence: float) -> float | None:
         """Return the least threshold that keeps the limit of the wrong share. If the pieces are too
         few for the limit, none of them may be wrong. None: only a threshold above 1 does."""
         limit = max(limit, max_share(0, len(self.worst), confidence))
         for threshold in [lowest, *np.nextafter(np.unique(self.worst), 2.0).tolist()]:
-            is_kept = max_share(self.num_wrong(threshold), len(self.worst), confidence) <= limit
+            is_kept = self.bound(threshold, confidence) <= limit
             if threshold >= lowest and is_kept:
                 return threshold if threshold <= 1.0 else None
         return None
@@ -179,64 +192,110 @@ def derive_certificate(
     config: LocalizerConfig,
     max_wrong_share: float,
     is_applied: bool,
+    group_by: Sequence[GroupKind] = (),
 ) -> Certificate:
     """Return the certificate that follows from the answers, of map version 0.
 
     Images of the place and others are bounded apart, because their shares depend on the user. So
     each bound has half of the error probability.
     """
-    groups = list[WorstAnswers]()
-    for is_of_place in (True, False):
-        numbers, wrong = list[int](), list[float]()
-        for row, condition in enumerate(conditions):
-            if condition.has_truth and (condition.kind == "walk") == is_of_place:
-                numbers += [row * 10**6 + number for number in condition.pieces]
-                wrong += condition.wrong_probabilities()
-        if numbers:
-            groups.append(WorstAnswers.from_numbers(numbers, wrong))
+    known = [condition for condition in conditions if condition.has_truth]
+    walks = [condition for condition in known if condition.kind == "walk"]
+    others = [condition for condition in known if condition.kind != "walk"]
+    groups = [_collect_pieces(some) for some in (walks, others) if some]
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(len(groups), 1)
-    lowest = config.evidence.min_probability
-    found = [group.find_threshold(lowest, max_wrong_share, confidence) for group in groups]
-    known = [level for level in found if level is not None]
-    threshold = max([lowest, *known]) if len(known) == len(found) else None
-    level = lowest if threshold is None else threshold
-    bounds = [max_share(group.num_wrong(level), len(group.worst), confidence) for group in groups]
+    limits = config.evidence.min_probability, max_wrong_share, confidence
+    found = [group.find_threshold(*limits) for group in groups]
+    threshold = None if None in found else max([limits[0], *(one or 0.0 for one in found)])
+    level = limits[0] if threshold is None else threshold
     right = [
         _probability(answer)
-        for condition in conditions
-        if condition.has_truth
+        for condition in known
         for answer in condition.answers
-        if answer.result.localized and not is_wrong(answer)
+        if answer.is_right
     ]
-    cameras = [
-        answer.camera for condition in conditions for answer in condition.answers if answer.camera
-    ]
+    applied = level if is_applied else 0.0
     settings, default = encode_json(config), encode_json(LocalizerConfig())
     return Certificate(
         map_version=0,
         program=version("topoloc"),
         date=today(),
         settings={key: value for key, value in settings.items() if value != default[key]},
-        cameras=[
-            f"{camera.width}x{camera.height}, {camera.model}, f {camera.fx:.0f} px"
-            for camera in dict.fromkeys(cameras)
-        ],
+        cameras=_describe_cameras(conditions),
         confidence=CONFIDENCE,
-        max_wrong_share=max(bounds, default=None),
+        max_wrong_share=max((one.bound(applied, confidence) for one in groups), default=None),
         requested_share=max_wrong_share,
         min_probability=threshold,
         lost_share=float(np.mean(np.array(right) < level)) if right else 0.0,
         is_applied=is_applied,
-        conditions=[condition.facts(level, confidence) for condition in conditions],
+        conditions=[condition.facts(applied, confidence) for condition in conditions],
+        threshold_wrong_share=max((one.bound(level, confidence) for one in groups), default=None),
+        quarters=find_quarters(
+            [a for one in walks for a in one.answers if _probability(a) >= applied]
+        ),
+        groups=[
+            _derive_group(walks, by, bounds, (limits[0], max_wrong_share), applied)
+            for by in group_by
+            for bounds in pairwise(GROUP_BOUNDS[by])
+        ],
     )
+
+
+def _derive_group(
+    walks: Sequence[CertifiedAnswers],
+    by: GroupKind,
+    bounds: tuple[float, float],
+    limits: tuple[float, float],
+    applied: float,
+) -> CertifiedGroup:
+    """Return the promise about images of walks with a difficulty within bounds. `limits` are the
+    least threshold and the requested share, `applied` is the map's threshold."""
+
+    def is_member(answer: EvaluatedQuery) -> bool:
+        return bounds[0] <= answer.difficulty(by) < bounds[1]
+
+    pieces = _collect_pieces(walks, is_member)
+    answers = [answer for walk in walks for answer in walk.answers if is_member(answer)]
+    given = [answer for answer in answers if _probability(answer) >= applied]
+    threshold = pieces.find_threshold(*limits, CONFIDENCE) if answers else None
+    return CertifiedGroup(
+        by=by,
+        low=bounds[0],
+        high=bounds[1] if math.isfinite(bounds[1]) else None,
+        num_images=len(answers),
+        num_pieces=len(pieces.worst),
+        num_localized=len(given),
+        num_wrong=sum(map(is_wrong, given)),
+        max_wrong_share=pieces.bound(applied, CONFIDENCE) if answers else None,
+        min_probability=threshold,
+        threshold_wrong_share=None if threshold is None else pieces.bound(threshold, CONFIDENCE),
+    )
+
+
+def _collect_pieces(
+    conditions: Sequence[CertifiedAnswers],
+    is_member: Callable[[EvaluatedQuery], bool] = lambda _: True,
+) -> WorstAnswers:
+    """Return the pieces of several conditions, of those answers alone that are members."""
+    numbers, wrong = list[int](), list[float]()
+    for row, condition in enumerate(conditions):
+        members = [is_member(answer) for answer in condition.answers]
+        numbers += [row * 10**6 + number for number in compress(condition.pieces, members)]
+        wrong += compress(condition.wrong_probabilities(), members)
+    return WorstAnswers.from_numbers(numbers, wrong)
+
+
+def _describe_cameras(conditions: Sequence[CertifiedAnswers]) -> list[str]:
+    cameras = [one.camera for condition in conditions for one in condition.answers if one.camera]
+    return [
+        f"{camera.width}x{camera.height}, {camera.model}, f {camera.fx:.0f} px"
+        for camera in dict.fromkeys(cameras)
+    ]
 
 
 def is_wrong(answer: EvaluatedQuery) -> bool:
     """Return whether an answer has a pose beyond 0.25 m or 2 degrees, or of another place."""
-    if not isinstance(answer.result, Localization):
-        return False
-    truth, pose = answer.world_from_cam, answer.result.world_from_cam
-    return truth is None or not truth.is_same(pose, MAX_TRANSLATION, math.radians(MAX_ROTATION_DEG))
+    return answer.result.localized and not answer.is_right
 
 
 def find_pieces(config: MapConfig, answers: Sequence[EvaluatedQuery], by_pose: bool) -> list[int]:

@@ -11,7 +11,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from itertools import pairwise
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +28,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import find_least_median
 from topoloc.json_data import OneLine, encode_json
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.certificate import Difficulty, Quarter
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image
 
@@ -35,6 +37,9 @@ RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 # A result with an error above either limit is a false accept: a wrong place, not an inaccurate
 # pose.
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
+RIGHT_TRANSLATION, RIGHT_ROTATION_DEG = 0.25, 2.0
+"""A pose further off than either (metres, degrees) is not right: the probability is about these."""
+_MIN_POSES = 8  # fewer are not split into quarters
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,6 +52,9 @@ class EvaluatedQuery(OneLine):
     - `neighbour_ids` are nodes as good as the nearest one, see `find_neighbour_ids`.
     - `is_in_other_world` is True if the pose is in the world of another atlas tile without a known
       transform. The pose then counts as false.
+    - `angle_deg` is the angle between the true pose and the nearest node, `light_ratio` the largest
+      ratio, 1 or more, of grey level, red and blue of the query and the likest node there. NaN if
+      unknown.
     """
 
     MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
@@ -62,6 +70,13 @@ class EvaluatedQuery(OneLine):
     camera: Camera | None = None
     neighbour_ids: frozenset[NodeId] = frozenset()
     is_in_other_world: bool = False
+    angle_deg: float = math.nan
+    light_ratio: float = math.nan
+
+    def difficulty(self, by: Difficulty) -> float:
+        """Return the value by which quarters and groups are ordered, NaN if unknown."""
+        inliers = float(self.result.num_inliers)
+        return {"inliers": inliers, "angle": self.angle_deg, "light": self.light_ratio}[by]
 
     @property
     def translation_m(self) -> float:
@@ -104,11 +119,18 @@ class EvaluatedQuery(OneLine):
         beyond the error limits."""
         if isinstance(self.result, NotLocalized):
             return False
-        if self.world_from_cam is None or self.is_in_other_world:
-            return True
-        return not self.world_from_cam.is_same(
-            self.result.world_from_cam, self.MAX_TRANSLATION, np.deg2rad(self.MAX_ROTATION_DEG)
-        )
+        return not self._is_within(self.MAX_TRANSLATION, self.MAX_ROTATION_DEG)
+
+    @property
+    def is_right(self) -> bool:
+        """Return whether the result has a pose within 0.25 m and 2 degrees of the true one."""
+        return self._is_within(RIGHT_TRANSLATION, RIGHT_ROTATION_DEG)
+
+    def _is_within(self, metres: float, degrees: float) -> bool:
+        truth = None if self.is_in_other_world else self.world_from_cam
+        if isinstance(self.result, NotLocalized) or truth is None:
+            return False
+        return truth.is_same(self.result.world_from_cam, metres, math.radians(degrees))
 
     def to_json(self) -> dict[str, Any]:
         """Return the result's JSON with its recording and its ground truth, which is null for an
@@ -146,7 +168,7 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     rotation = np.array([a.rotation_deg for a in with_truth])
     localized = np.isfinite(translation)
     is_inside = np.array([a.is_inside_ellipsoid for a in with_truth], bool)
-    is_inaccurate = (translation > 0.25) | (rotation > 2.0)  # what p is about
+    is_inaccurate = (translation > RIGHT_TRANSLATION) | (rotation > RIGHT_ROTATION_DEG)
     ranked = [a for a in with_truth if a.nearest_node_id is not None]
     first = [(a, a.result.candidates[0].node_id if a.result.candidates else None) for a in ranked]
     hits = [node == a.nearest_node_id for a, node in first]
@@ -161,6 +183,7 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
         "max_rotation_deg": float(rotation[localized].max()) if localized.any() else None,
         "num_inaccurate": int(is_inaccurate.sum()),
         "num_outside_ellipsoid": int((localized & ~is_inside).sum()),
+        "quarters": [encode_json(quarter) for quarter in find_quarters(answers)],
         "recall": {
             f"{metres:g}m_{degrees:g}deg": float(
                 np.mean((translation <= metres) & (rotation <= degrees))
@@ -179,6 +202,36 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
             for stage in sorted({stage for a in answers for stage in a.result.times_ms})
         },
     }
+
+
+def find_quarters(answers: Sequence[EvaluatedQuery]) -> list[Quarter]:
+    """Return the quarters of the poses with ground truth, the hardest first, by each difficulty: by
+    inliers, by the angle to the nearest node, by the change of light. Those of a difficulty that
+    fewer than eight poses have are left out."""
+    posed = [a for a in answers if a.world_from_cam is not None and a.result.localized]
+    found = list[Quarter]()
+    for by in get_args(Difficulty):
+        known = [a for a in posed if math.isfinite(a.difficulty(by))]
+        known.sort(key=lambda a, by=by: a.difficulty(by), reverse=by != "inliers")
+        ends = [len(known) * part // 4 for part in range(5)]
+        if len(known) >= _MIN_POSES:
+            found += [_measure_quarter(by, known[a:b]) for a, b in pairwise(ends)]
+    return found
+
+
+def _measure_quarter(by: Difficulty, posed: Sequence[EvaluatedQuery]) -> Quarter:
+    results = [a.result for a in posed if isinstance(a.result, Localization)]
+    return Quarter(
+        by=by,
+        hardest=posed[0].difficulty(by),
+        easiest=posed[-1].difficulty(by),
+        num_poses=len(posed),
+        num_right=sum(a.is_right for a in posed),
+        mean_probability=float(np.mean([one.probability for one in results])),
+        num_inside=sum(a.is_inside_ellipsoid for a in posed),
+        median_position_sigma_m=float(np.median([one.position_sigma_m for one in results])),
+        median_rotation_sigma_deg=float(np.median([one.rotation_sigma_deg for one in results])),
+    )
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -14,19 +15,23 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.evaluation.metrics import (
     EvaluatedQuery,
     WorldFit,
+    find_quarters,
     fit_worlds,
     group_by_recording,
     summarize,
 )
+from topoloc.geometry.alignment import rotation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
 from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
+from topoloc.mapping.certificate import Quarter
 from topoloc.mapping.config import Progress
 from topoloc.mapping.nodes import node_distances
+from topoloc.mapping.storage.entries import Illumination
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.node_ids import NodeId
-from topoloc.recordings.frame import StereoSequence
+from topoloc.node_ids import NodeId, Row, as_rows
+from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,6 +68,11 @@ class Evaluation(OneLine):
         medians (m, degrees, ms), recall, false accepts."""
         return summarize(self.answers)
 
+    @cached_property
+    def quarters(self) -> list[Quarter]:
+        """Return the quarters of the poses by difficulty, the hardest first."""
+        return find_quarters(self.answers)
+
 
 def evaluate(
     localizer: Localizer,
@@ -97,6 +107,7 @@ def evaluate(
 
 # A node within this many D_thresh counts as a neighbour of the query.
 NEIGHBOUR_RADIUS = 1.5
+LogLight: TypeAlias = Float[np.ndarray, " 3"]
 
 
 def localize_queries(
@@ -129,18 +140,26 @@ def localize_queries(
         topomap, tile_id = in_tile.topomap, in_tile.tile_ids[0]
         nodes = topomap.node_poses
     frames = find_frames_with_truth(sequence) if frames is None else frames
-    label, answers = label or sequence.name, []
+    label, answers, lights = label or sequence.name, [], dict[Row, LogLight]()
     for done, i in enumerate(frames):
-        answer, pose = _localize(localizer, sequence, i, label), sequence.poses[i]
+        frame, pose = sequence[i], sequence.poses[i]
+        answer = _localize(localizer, frame, partial(_read_image, sequence, i), label)
         if pose is None:
             raise TrajectoryError(f"{answer.query}: no known pose to judge against")
         world_from_cam = pose if map_from_truth is None else map_from_truth @ pose
         distances = node_distances(world_from_cam, nodes, topomap.config.lambda_rot)
+        nearest = topomap.summaries[int(np.argmin(distances))]
+        reach = max(NEIGHBOUR_RADIUS * topomap.config.d_thresh, float(distances.min()))
+        with localizer.in_tile(tile_id) as in_tile:
+            rows = as_rows(np.flatnonzero(distances <= reach).tolist())
+            light_ratio = _find_light_ratio(frame.image, in_tile.topomap, rows, lights)
         answer = replace(
             answer,
             world_from_cam=world_from_cam,
-            nearest_node_id=topomap.summaries[int(np.argmin(distances))].node_id,
+            nearest_node_id=nearest.node_id,
             neighbour_ids=find_neighbour_ids(topomap, distances),
+            angle_deg=math.degrees(rotation_error(world_from_cam, nearest.world_from_cam)),
+            light_ratio=light_ratio,
         )
         answers.append(_to_answered_world(localizer, answer, tile_id))
         if progress:
@@ -170,7 +189,7 @@ def localize_out_of_map(
     label, frames = label or sequence.name, range(len(sequence)) if frames is None else frames
     answers = []
     for done, i in enumerate(frames):
-        answers.append(_localize(localizer, sequence, i, label))
+        answers.append(_localize(localizer, sequence[i], partial(_read_image, sequence, i), label))
         if progress:
             progress(f"{label} (out of map)", done + 1, len(frames))
     return answers
@@ -211,14 +230,40 @@ def _to_answered_world(
         is_in_other_world=truth is None,
         nearest_node_id=None,
         neighbour_ids=frozenset(),
+        angle_deg=math.nan,
+        light_ratio=math.nan,
     )
 
 
+def _find_light_ratio(
+    image: Image, topomap: TopoMetricMap, rows: Sequence[Row], lights: dict[Row, LogLight]
+) -> float:
+    """Return the ratio of light between an image and the likest of some nodes: the largest, 1 or
+    more, of those of grey level, red and blue. NaN if no node keeps an image. `lights` keeps those
+    of nodes read before."""
+    for row in rows:
+        if row not in lights and (stored := topomap.nodes[row].read_image()) is not None:
+            lights[row] = _measure_light(stored)
+    own = _measure_light(image)
+    logs = [float(np.nanmax(abs(lights[row] - own))) for row in rows if row in lights]
+    return math.exp(min(logs, default=math.nan))
+
+
+def _measure_light(image: Image) -> LogLight:
+    """Return the logarithms of mean grey level, red and blue over green; NaN of a grey image."""
+    light = Illumination.of_image(image)
+    colours = (light.red, light.blue) if image.ndim == 3 else (math.nan, math.nan)
+    return np.log(np.maximum((light.level, *colours), 1 / 255))  # a level of 0 has no ratio
+
+
+def _read_image(sequence: StereoSequence, index: int) -> Image:
+    return sequence[index].image
+
+
 def _localize(
-    localizer: Localizer, sequence: StereoSequence, index: int, label: str
+    localizer: Localizer, frame: StereoFrame, read_image: Callable[[], Image], label: str
 ) -> EvaluatedQuery:
     """Localize a frame. Return the result without ground truth."""
-    frame = sequence[index]
     if frame.camera is None:
         raise CalibrationError(
             f"{frame.name}: no calibration; put a camera.json into the recording's folder"
@@ -228,6 +273,6 @@ def _localize(
         localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns),
         None,
         recording=label,
-        read_image=lambda: sequence[index].image,
+        read_image=read_image,
         camera=frame.camera,
     )

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, Struct, to_builtins
 
 from topoloc.json_data import Count, NonNegative
 
 ConditionKind = Literal["walk", "surroundings_removed", "out_of_map"]
+Difficulty = Literal["inliers", "angle", "light"]
+GroupKind = Literal["angle", "light"]
 _Share = Annotated[float, Meta(ge=0, le=1)]
 _Text = Annotated[str, Meta(max_length=1000)]
 
@@ -53,16 +55,104 @@ class CertifiedCondition(Struct, frozen=True, forbid_unknown_fields=True):
         return "; ".join([text, ", ".join(times)]) if times else text
 
 
+class Quarter(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the figures of a quarter of the poses with a known truth, ordered by difficulty.
+
+    - `by` is `inliers`, `angle` (degrees between the image and the nearest node by Eq. 1) or
+      `light` (the largest ratio, 1 or more, of the mean grey level, red over green and blue over
+      green of the image and the likest node there). `hardest` and `easiest` are its extremes.
+    - `num_right` counts poses within 0.25 m and 2 degrees, `num_inside` those whose true pose is
+      inside the 95 % ellipsoid.
+    """
+
+    COLUMNS: ClassVar = (
+        "quarter by",
+        "hardest to easiest",
+        "poses",
+        "right",
+        "mean p",
+        "inside 95 %",
+        "median sigma",
+    )
+
+    by: Difficulty
+    hardest: NonNegative
+    easiest: NonNegative
+    num_poses: Count
+    num_right: Count
+    mean_probability: _Share
+    num_inside: Count
+    median_position_sigma_m: NonNegative
+    median_rotation_sigma_deg: NonNegative
+
+    def cells(self) -> tuple[str, ...]:
+        """Return the figures as text, in the order of the columns."""
+        digits, unit = {"inliers": (0, ""), "angle": (1, " deg"), "light": (2, "")}[self.by]
+        return (
+            self.by,
+            f"{self.hardest:.{digits}f} to {self.easiest:.{digits}f}{unit}",
+            str(self.num_poses),
+            f"{100 * self.num_right / self.num_poses:.1f} %",
+            f"{100 * self.mean_probability:.1f} %",
+            f"{100 * self.num_inside / self.num_poses:.1f} %",
+            f"{100 * self.median_position_sigma_m:.2f} cm,"
+            f" {self.median_rotation_sigma_deg:.2f} deg",
+        )
+
+
+class CertifiedGroup(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the promise about images of walks whose `by` (as of `Quarter`) is from `low` to below
+    `high`, None: without end. The other fields are those of `Certificate` and its conditions."""
+
+    by: GroupKind
+    low: NonNegative
+    high: NonNegative | None
+    num_images: Count
+    num_pieces: Count
+    num_localized: Count
+    num_wrong: Count
+    max_wrong_share: _Share | None
+    min_probability: _Share | None
+    threshold_wrong_share: _Share | None
+
+    def name(self) -> str:
+        """Return the group in words."""
+        unit = " deg" if self.by == "angle" else ""
+        if self.high is None:
+            return f"{self.by} {self.low:g}{unit} or more"
+        return f"{self.by} {self.low:g} to {self.high:g}{unit}"
+
+    def describe(self) -> str:
+        """Return the promise as text."""
+        share, at_threshold = self.max_wrong_share, self.threshold_wrong_share
+        if share is None:
+            return "no promise: the walks have no such image"
+        beside = "" if self.min_probability is not None else "; no threshold makes it less"
+        if at_threshold is not None and at_threshold < share:
+            share_text = f"{100 * at_threshold:.2g} %"
+            beside = (
+                f"; a threshold of {self.min_probability:.3g}, not applied, makes it {share_text}"
+            )
+        return (
+            f"at most {100 * share:.2g} % wrong (n = {self.num_pieces}); {self.num_localized} of"
+            f" {self.num_images} images localized, {self.num_wrong} wrong{beside}"
+        )
+
+
 class Certificate(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold a promise about the answers of a map, with the conditions in which it was measured.
 
     - `map_version` is the number of the edit that stored it. `settings` names the settings that
       were not the default, `cameras` the cameras of the images.
     - `max_wrong_share` is the promise: with probability `confidence`, at most this share of
-      independent images like these gets a wrong pose. None if no image had a known pose.
-    - `min_probability` is the threshold of the probability that keeps the promise. None if no
-      threshold below 1 does. Answers below it are refused only if `is_applied`.
-    - `lost_share` is the share of right answers that the threshold refuses.
+      independent images like these gets a wrong pose. None if no image had a known pose. It and the
+      conditions count the answers as the map gives them.
+    - `min_probability` is the threshold of the probability that keeps the requested share. None if
+      no threshold below 1 does. Answers below it are refused only if `is_applied`.
+    - `lost_share` is the share of right answers that the threshold refuses, or would refuse, and
+      `threshold_wrong_share` the promise with it. The latter is None in certificates of older
+      versions: all their figures are at the threshold.
+    - `quarters` are those of the walks by difficulty, `groups` promises for groups of their images.
     """
 
     map_version: Count
@@ -77,6 +167,9 @@ class Certificate(Struct, frozen=True, forbid_unknown_fields=True):
     lost_share: _Share
     is_applied: bool
     conditions: list[CertifiedCondition]
+    threshold_wrong_share: _Share | None = None
+    quarters: list[Quarter] = []
+    groups: list[CertifiedGroup] = []
 
     @property
     def applied_min_probability(self) -> float:
@@ -98,15 +191,27 @@ class Certificate(Struct, frozen=True, forbid_unknown_fields=True):
         kinds = {one.kind for one in self.conditions if one.has_truth}
         named = [text for kind, text in _CONDITIONS.items() if kind in kinds]
         num_pieces = sum(one.num_pieces for one in self.conditions if one.has_truth)
-        if self.min_probability is None:
-            threshold = "at any threshold"
-        else:
-            threshold = f"at a probability of at least {self.min_probability:.3g}"
+        level, is_older = "", self.threshold_wrong_share is None
+        if self.min_probability is not None and (self.is_applied or is_older):
+            level = f" at a probability of at least {self.min_probability:.3g}"
         return (
             f"of independent images like these ({', '.join(named)}), at most"
-            f" {100 * self.max_wrong_share:.2g} % get a wrong pose {threshold}, with"
+            f" {100 * self.max_wrong_share:.2g} % get a wrong pose{level}, with"
             f" {100 * self.confidence:g} % confidence (n = {num_pieces})"
         )
+
+    def describe_threshold(self) -> str:
+        """Return the threshold, whether it is applied, and what it promises and loses, as text."""
+        lost = f"{100 * self.lost_share:.1f} % of the right answers"
+        if self.min_probability is None:
+            return f"none keeps {100 * self.requested_share:.2g} %: wrong answers have p = 1"
+        if self.is_applied:
+            return f"{self.min_probability:.3g}, applied; it refuses {lost}"
+        text = f"{self.min_probability:.3g}, not applied (topoloc certify --apply)"
+        if self.threshold_wrong_share is None:
+            return f"{text}; it would refuse {lost}"
+        share = f"{100 * self.threshold_wrong_share:.2g} %"
+        return f"{text}; with it at most {share} would be wrong, and {lost} refused"
 
     def limits(self) -> str:
         """Return what the promise does not cover."""

@@ -197,6 +197,7 @@ class TopoMetricMap:
             return None
         return one.to_json() | {
             "promise": one.promise(),
+            "threshold": one.describe_threshold(),
             "is_outdated": one.is_outdated(self.version),
         }
 

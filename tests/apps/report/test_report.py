@@ -94,6 +94,8 @@ def test_numbers_on_the_page_are_those_of_the_evaluation(page: str):
     assert "largest 40 m" in page or "largest 4e+03 cm" in page
     assert "1 position is outside of the figure. Arrows name the distance" in page
     assert "1.23 MB" in page
+    hard = page[page.index("Where it is hard") : page.index("The place")]
+    assert hard.count('<td data-column="quarter by">inliers</td>') == 4
 
 
 def test_the_worst_come_first():

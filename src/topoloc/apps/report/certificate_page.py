@@ -13,6 +13,7 @@ from topoloc.apps.report.page_template import (
     render_section,
     render_table,
 )
+from topoloc.apps.report.report_tables import render_quarters
 from topoloc.plugin import write_text
 
 _COLUMNS = (
@@ -28,6 +29,11 @@ _FIGURES = (
     "An answer is wrong beyond 0.25 m or 2 degrees. Images of one piece of the walk are not"
     " independent, so pieces are counted. A piece is wrong if any of its answers is."
 )
+_GROUPS = (
+    "Images of the walks alone, by the angle to the nearest mapped frame and by light (the largest"
+    " ratio of their mean grey levels and colours). Each promise has 95 % confidence for itself. No"
+    " threshold of a group is applied."
+)
 _PLAN = "Walks with known poses. Blind spots are pieces of which no image was localized."
 
 
@@ -35,12 +41,18 @@ def write_certificate(path: Path, found: Certification, topomap: TopoMetricMap, 
     """Write the page atomically. Raises TopolocError: the file cannot be written."""
     one = found.certificate
     lead = f'<p class="lead">{escape(one.promise()[:1].upper() + one.promise()[1:])}.</p>'
-    limits = f"<p>Limits: {escape(one.limits())}.</p>"
+    limits = f"<p>Threshold: {escape(one.describe_threshold())}.</p>"
+    limits += f"<p>Limits: {escape(one.limits())}.</p>"
     sections = [
         _render_cards(found),
         render_section("The promise", "", lead + limits),
         render_section("What was measured", _FIGURES, _render_conditions(found)),
     ]
+    if one.groups:
+        rows = [(escape(group.name()), escape(group.describe())) for group in one.groups]
+        table = render_table(("group", "promise"), rows, "tried", "Groups")
+        sections.append(render_section("Promises for groups", _GROUPS, table))
+    sections.append(render_quarters(one.quarters))
     walks = [
         answer
         for condition in found.conditions
@@ -59,6 +71,7 @@ def write_certificate(path: Path, found: Certification, topomap: TopoMetricMap, 
 def _render_cards(found: Certification) -> str:
     one = found.certificate
     share, threshold = one.max_wrong_share, one.min_probability
+    state, loses = ("applied", "lost") if one.is_applied else ("not applied", "would be lost")
     kept = share is not None and share <= one.requested_share
     cards = [
         (
@@ -66,8 +79,8 @@ def _render_cards(found: Certification) -> str:
             "none" if share is None else f"{100 * share:.2g} %",
             "at most wrong",
         ),
-        ("", "none" if threshold is None else f"{threshold:.3g}", "least probability"),
-        ("", f"{100 * one.lost_share:.1f} %", "of the right answers lost by it"),
+        ("", "none" if threshold is None else f"{threshold:.3g}", f"threshold, {state}"),
+        ("", f"{100 * one.lost_share:.1f} %", f"of the right answers {loses} by it"),
         ("", str(len(found.blind_spots)), "blind spots"),
     ]
     return render_cards(cards)
@@ -90,7 +103,7 @@ def _render_conditions(found: Certification) -> str:
                 ", ".join("none" if ms is None else f"{ms:.0f}" for ms in times),
             )
         )
-    return render_table(_COLUMNS, rows, label="Conditions")
+    return render_table(_COLUMNS, rows, "tried", "Conditions")
 
 
 def _list_spots(found: Certification) -> str:
@@ -104,12 +117,11 @@ def _list_spots(found: Certification) -> str:
 
 def _render_facts(found: Certification) -> str:
     one = found.certificate
-    state = "answers below the threshold are refused" if one.is_applied else "not applied"
     facts = {
         "cameras": "; ".join(one.cameras),
         "settings": ", ".join(f"{name} = {value}" for name, value in one.settings.items()),
         "confidence": f"{100 * one.confidence:g} %",
-        "threshold": state,
+        "threshold": one.describe_threshold(),
     }
     rows = [(name, escape(text or "default")) for name, text in facts.items()]
     return render_table(("", "value"), rows)

@@ -41,6 +41,7 @@ from topoloc.apps.report.report_tables import (
     explain_shares,
     render_headline_cards,
     render_number_tables,
+    render_quarters,
     render_recordings_table,
 )
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
@@ -220,9 +221,11 @@ def _render_sections(
     paragraphs = "".join(f'<p class="lead">{escape(text)}</p>' for text in texts.paragraphs)
     table = render_recordings_table(evaluation, texts)
     yield render_section("Results", explain_shares(evaluation), table + paragraphs)
+    evaluated = Evaluation(answers)
+    yield render_quarters(evaluated.quarters)
     sets = [
         ResultSet(name or "queries", [answer.to_json() for answer in group])
-        for name, group in Evaluation(answers).by_recording.items()
+        for name, group in evaluated.by_recording.items()
     ]
     name = Path(evaluation["map"]["path"]).name
     document = create_document(topomap, name, sets, _SCENE_BUDGET)

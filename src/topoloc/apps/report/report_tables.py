@@ -9,7 +9,12 @@ from typing import Any
 
 from topoloc import EvaluatedQuery
 from topoloc.apps.core_names import format_length
-from topoloc.apps.report.page_template import recording_colours, render_cards, render_table
+from topoloc.apps.report.page_template import (
+    recording_colours,
+    render_cards,
+    render_section,
+    render_table,
+)
 
 _COLUMNS = (
     "recording",
@@ -19,6 +24,15 @@ _COLUMNS = (
     "in 25 cm, 2°",
     "false accepts",
     "ms",
+)
+
+
+_QUARTERS = (
+    "The poses with known truth, in quarters of difficulty, the hardest first: by inliers, by the"
+    " angle between the image and the nearest mapped frame, and by light (largest ratio of their"
+    " mean grey levels and colours). Right is within 25 cm and 2°. If p and the covariance are"
+    " honest, mean p is the share right in each quarter, and 95 % of the true poses are inside the"
+    " 95 % ellipsoid."
 )
 
 
@@ -124,6 +138,15 @@ def render_number_tables(evaluation: dict[str, Any]) -> str:
     if "total" in e["median_times_ms"]:
         about_map.append(("Median of a query", f"{e['median_times_ms']['total']:.1f} ms"))
     return f'<div class="columns">{_render_facts(rows)}{_render_facts(about_map)}</div>'
+
+
+def render_quarters(quarters: Sequence[Any]) -> str:
+    """Return `Evaluation.quarters`, or those of a certificate, as a section; nothing if empty."""
+    if not quarters:
+        return ""
+    rows = [[escape(cell) for cell in one.cells()] for one in quarters]
+    table = render_table(quarters[0].COLUMNS, rows, "tried", "Quarters of difficulty")
+    return render_section("Where it is hard", _QUARTERS, table)
 
 
 def explain_shares(evaluation: dict[str, Any]) -> str:

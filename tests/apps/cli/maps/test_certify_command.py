@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from built_room import unseen_views, write_pictures
 from topoloc.apps.cli import main
+from topoloc.mapping.certificate import Certificate
+from topoloc.mapping.edit import edit_map
 
 Complaint = Callable[..., str]
 
@@ -40,6 +44,7 @@ def test_certify_prints_stores_and_draws_the_promise(
 ):
     command = ["certify", str(own_map), "--walk", str(queries), "--out-of-map", str(elsewhere)]
     outputs = ["--json", str(tmp_path / "c.json"), "--report", str(tmp_path / "c.html")]
+    command += ["--by", "light,angle"]
     assert main([*command, *outputs]) == 0
     printed = capsys.readouterr().out
     found = json.loads((tmp_path / "c.json").read_text())
@@ -52,12 +57,42 @@ def test_certify_prints_stores_and_draws_the_promise(
     page = (tmp_path / "c.html").read_text()
     assert "elsewhere" in page
     assert "<svg" in page
+    by_light = [one for one in found["groups"] if one["by"] == "light"]
+    assert [one["num_images"] for one in by_light] == [len(unseen_views()), 0, 0]
+    assert {one["by"] for one in found["quarters"]} == {"inliers", "angle", "light"}
     assert main(["info", str(own_map)]) == 0
-    assert found["promise"] in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    for text in (printed, shown, page):
+        assert found["promise"][1:] in text
+        assert "not applied (topoloc certify --apply); with it at most" in text
+        assert "light 1 to 1.25" in text
+        assert "angle 30 deg or more" in text
+        assert "hardest to easiest" in text
+    scene = tmp_path / "scene.json"
+    assert main(["view", str(own_map), "--json", str(scene)]) == 0
+    assert json.loads(scene.read_text())["map"]["certificate"]["threshold"] in shown
     assert main(["georeference", str(own_map), "--origin", "50.8,4.7,30,0"]) == 0
     capsys.readouterr()
     assert main(["info", str(own_map)]) == 0
     assert "outdated: of version 2" in capsys.readouterr().out
+
+
+def test_a_certificate_of_an_older_version_is_shown_as_it_was_measured(
+    own_map: Path, queries: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["certify", str(own_map), "--walk", str(queries)]) == 0
+    with edit_map(own_map) as edit:
+        assert edit.topomap.certificate is not None
+        facts = edit.topomap.certificate.to_json() | {"min_probability": 0.8}
+        for name in ("threshold_wrong_share", "quarters", "groups"):  # came later
+            del facts[name]
+        older = msgspec.convert(facts, Certificate)
+        edit.commit(replace(edit.topomap, certificate=older), "certify")
+    capsys.readouterr()
+    assert main(["info", str(own_map)]) == 0
+    shown = capsys.readouterr().out
+    assert "get a wrong pose at a probability of at least 0.8, with 95 % confidence" in shown
+    assert "0.8, not applied (topoloc certify --apply); it would refuse" in shown
 
 
 def test_a_map_alone_states_the_limits_of_that(own_map: Path, capsys: pytest.CaptureFixture[str]):
@@ -73,11 +108,13 @@ def test_a_map_alone_states_the_limits_of_that(own_map: Path, capsys: pytest.Cap
         (["--max-wrong", "0"], "--max-wrong must be a percentage"),
         (["--walk", "missing"], "missing: no such file or folder"),
         (["--map-from-truth", "missing.json"], "missing.json"),
+        (["--by", "light"], "--by groups the images of walks with true poses: add --walk SEQ"),
+        (["--by", "light,day"], "--by takes light, angle or light,angle, not 'day'"),
     ],
 )
 def test_wrong_arguments_are_one_line(
     own_map: Path, complaint: Complaint, arguments: list[str], fault: str
 ):
-    before, status = own_map.read_bytes(), 2 if "--max-wrong" in arguments else 1
+    before, status = own_map.read_bytes(), 2 if arguments[0] in ("--max-wrong", "--by") else 1
     assert fault in complaint("certify", str(own_map), *arguments, status=status)
     assert own_map.read_bytes() == before

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -31,6 +31,7 @@ from topoloc.apps.cli.output import (
     option,
     print_fields,
     print_line,
+    print_quarters,
     print_waiting,
     progress_bar,
     write_json,
@@ -63,6 +64,9 @@ class Command:
     0.5 needs at least 736 independent images of each kind without a wrong answer."""
     apply: Flag = False
     """Refuse answers below the found threshold from now on. Without it, no answer changes."""
+    by: Annotated[str | None, option("light,angle")] = None
+    """Also give a promise for each group of the walks' images: by the change of light, by the angle
+    to the nearest mapped frame, or by each. The threshold stays one for all."""
     format: Format = None
     camera: CameraOption = None
     poses: PosesOption = None
@@ -77,12 +81,15 @@ class Command:
     def run(self) -> int:
         if not 0.0 < self.max_wrong < 100.0:
             raise UsageError(f"--max-wrong must be a percentage, not {self.max_wrong:g}")
+        group_by = self._group_by()
         read = [self.map, *self.walk, *self.out_of_map, self.map_from_truth, self.config]
         check_outputs([self.json, self.report], read)
         write_page = _import_page_writer() if self.report else None
         map_from_truth = read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         config = read_settings(self.config).get(LocalizerConfig)
         walks, others = ([self._open(one) for one in of] for of in (self.walk, self.out_of_map))
+        if self.by and not any(pose for walk in walks for pose in walk.poses):
+            raise UsageError("--by groups the images of walks with true poses: add --walk SEQ")
         with progress_bar() as progress:
             found = certify(
                 self.map,
@@ -94,6 +101,7 @@ class Command:
                 config,
                 progress,
                 print_waiting,
+                group_by,
             )
         if self.json != "-":
             _print(found)
@@ -104,6 +112,14 @@ class Command:
             if self.json != "-":
                 print_line(f"report: {self.report}")
         return 0
+
+    def _group_by(self) -> list[Literal["angle", "light"]]:
+        """Return the groups of --by. Raises UsageError: there is no such group."""
+        names = self.by.split(",") if self.by else []
+        for name in names:
+            if name not in ("angle", "light"):
+                raise UsageError(f"--by takes light, angle or light,angle, not {name!r}")
+        return [name for name in ("light", "angle") if name in names]
 
     def _open(self, path: str) -> StereoSequence:
         sequence = open_recording(path, self.format, self.camera, whole_only=True)
@@ -124,14 +140,11 @@ def _print(found: Certification) -> None:
     certificate = found.certificate
     rows = [(one.name, one.describe()) for one in certificate.conditions]
     facts = [("promise", certificate.promise()), *rows]
-    if certificate.min_probability is None:
-        facts.append(("threshold", "none keeps the promise: some wrong answers have p = 1"))
-    else:
-        state = "applied" if certificate.is_applied else "not applied (--apply)"
-        lost = f"it refuses {100 * certificate.lost_share:.1f} % of the right answers"
-        facts.append(("threshold", f"{certificate.min_probability:.3g}, {state}; {lost}"))
+    facts += [(one.name(), one.describe()) for one in certificate.groups]
+    facts.append(("threshold", certificate.describe_threshold()))
     if spots := found.blind_spots:
         where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*p.translation) for p in spots[:5])
         facts.append(("blind spots", f"{len(spots)}, at {where}{' ...' if len(spots) > 5 else ''}"))
     facts.append(("limits", certificate.limits()))
     print_fields(facts)
+    print_quarters(certificate.quarters)

@@ -32,6 +32,7 @@ from topoloc.apps.cli.output import (
     option,
     print_fields,
     print_line,
+    print_quarters,
     write_json,
 )
 from topoloc.apps.export.formats import coordinates, geojson_feature
@@ -77,12 +78,13 @@ class Command:
                 write_graph(topomap, Path(self.graph))
             info = topomap.describe(path) | ({"check": "ok"} if self.check else {})
         if self.json != "-":
-            _print(info)
+            _print(info, topomap)
         write_json(self.json, info)
         return 0
 
 
-def _print(info: dict[str, Any]) -> None:
+def _print(info: dict[str, Any], topomap: TopoMetricMap) -> None:
+    certificate = topomap.certificate
     nodes, features = (info["config"].get(name, {}) for name in ("nodes", "features"))
     normalization, nan = features.get("normalization"), float("nan")
     geo, unknown = info["georeference"], "unknown (topoloc georeference sets it)"
@@ -111,9 +113,12 @@ def _print(info: dict[str, Any]) -> None:
             ("features", kinds),
             ("floors", f"{floors} (topoloc update --look-alike-floors changes it)"),
             ("certificate", _describe_certificate(info["certificate"])),
+            *([("threshold", certificate.describe_threshold())] if certificate else []),
+            *((one.name(), one.describe()) for one in (certificate.groups if certificate else ())),
             *([("check", info["check"])] if "check" in info else []),
         ]
     )
+    print_quarters(certificate.quarters if certificate else [])
 
 
 def _describe_certificate(certificate: dict[str, Any] | None) -> str:

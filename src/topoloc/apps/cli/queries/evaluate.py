@@ -37,6 +37,7 @@ from topoloc.apps.cli.output import (
     option,
     print_fields,
     print_line,
+    print_quarters,
     print_recordings,
     progress_bar,
     write_json,
@@ -152,6 +153,7 @@ class Command:
         }
         if self.json != "-":
             _print(evaluation)
+            print_quarters(evaluated.quarters)
         for fit in fits:
             line = _report_world_fit(fit, self.fit_map_from_truth)
             print_line(line, sys.stderr if self.json == "-" else sys.stdout)

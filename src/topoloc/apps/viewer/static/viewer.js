@@ -246,6 +246,9 @@ export class Viewer {
     if (map.certificate) {
       const outdated = map.certificate.is_outdated ? " (outdated: the map was edited since)" : "";
       said.push(`Certified: ${map.certificate.promise}${outdated}.`);
+      said.push(`Threshold: ${map.certificate.threshold}.`);
+      const hardest = map.certificate.quarters.filter((one, row, all) => one.by !== all[row - 1]?.by);
+      for (const one of hardest) said.push(`Hardest quarter by ${one.by}: ${one.num_right} of ${one.num_poses} right, ${one.num_inside} inside their 95 % ellipsoid.`);
     }
     if (map.num_points_shown < 0.99 * map.num_points) said.push(`${map.num_points_shown.toLocaleString("en")} of the points are shown.`);
     if (map.sessions.length > 1) said.push(`Sessions: ${map.sessions.map((one) => one.name).join(", ")}.`);
