@@ -78,6 +78,9 @@ class PlayedRobot:
     def __init__(self, camera: Camera, domain: int, hz: float = 10.0) -> None:
         self.camera, self.hz, self.heard = camera, hz, Heard()
         self.is_calibrated = True  # otherwise K is zero
+        self.has_noise = True  # no two images of a real camera are equal
+        self.encoding: str | None = None  # that of the images, or a wrong one
+        self.has_info = True
         self._node = RosNode(RobotConfig(domain=domain))
         self.ros = ros = self._node.messages
         create = self._node.create_writer
@@ -202,11 +205,11 @@ class PlayedRobot:
         projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
         roi = ros.RegionOfInterest(0, 0, 0, 0, False)
         for number, step in enumerate(self.steps):
-            # No two images of a camera are equal.
             shown = step.picture.copy()
-            shown.ravel()[noise.integers(0, shown.size, 50)] ^= 1
+            if self.has_noise:
+                shown.ravel()[noise.integers(0, shown.size, 50)] ^= 1
             height, width = shown.shape[:2]
-            encoding = "mono8" if shown.ndim == 2 else "rgb8"
+            encoding = self.encoding or ("mono8" if shown.ndim == 2 else "rgb8")
             t_ns = self.start_ns + round(number * 1e9 / self.hz)
             header = ros.Header(ros.Time(*divmod(t_ns, 1_000_000_000)), "camera_optical")
             row = width * (1 if shown.ndim == 2 else 3)
@@ -215,12 +218,12 @@ class PlayedRobot:
             data = image.serialize()  # before its time, since a driver does this at once
             image.serialize = lambda *_, data=data, **__: data
             _sleep_until(t_ns)
-            self._info(
-                ros.CameraInfo(
-                    header, height, width, "plumb_bob", [0.0] * 5, matrix, rotation, projection,
-                    0, 0, roi,
-                )
+            info = ros.CameraInfo(
+                header, height, width, "plumb_bob", [0.0] * 5, matrix, rotation, projection,
+                0, 0, roi,
             )  # fmt: skip
+            if self.has_info:
+                self._info(info)
             self._image.write(image)
 
     def _create_own_writer(self, name: str, kind: Any, quality: Any) -> Any:

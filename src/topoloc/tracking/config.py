@@ -27,3 +27,5 @@ class TrackerConfig:
     """Mode "paper": maximum distance between two consecutive poses, metres (the paper: 1 to 5, by
     the size of the place)."""
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
+    simulated: bool = False
+    """The images are of a simulator without noise: equal ones show that the camera stands."""

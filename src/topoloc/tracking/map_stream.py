@@ -95,9 +95,14 @@ class MapStream:
         self._drop_stale_reference()
         return self._complete_result(self._make_predicted_pose(result, t_ns))
 
+    def hold(self, t_ns: int, odom_from_cam: Rigid3 | None) -> None:
+        """Take an image that shows that the camera stands since the last one, where odometry was
+        `odom_from_cam`. It measures nothing anew: poses and covariances stay."""
+        self._hypotheses.hold(t_ns, odom_from_cam)
+
     def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
         result = self.localizer.with_provenance(answer.result, camera, answer.t_ns)
-        return replace(answer, result=result)
+        return replace(answer, result=result, track=self._hypotheses.track)
 
     def _process_paper_mode(self, result: Localization | NotLocalized, t_ns: int) -> StreamedPose:
         """Apply section III-B to one result: "when such a jump is found, we copy the previous pose

@@ -135,7 +135,7 @@ class MotionHypothesis:
     `state` and `odom_from_cam` belong to the last measured pose, `current` to the current image.
     `from_best` transforms poses of the best hypothesis into those of this one, and stays valid
     under common motion. `candidate_idx` is the index of the candidate used for this image, None if
-    none was.
+    none was. `track` numbers the hypotheses that an image started.
     """
 
     state: MotionState
@@ -145,6 +145,7 @@ class MotionHypothesis:
     node_id: NodeId
     from_best: Rigid3
     candidate_idx: int | None
+    track: int = 0
 
     def measured(
         self, state: MotionState, odom_from_cam: Rigid3 | None, **changes: Any

@@ -14,6 +14,7 @@ localization, and walls of equal panels. The motion of tracked points applies to
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -36,6 +37,8 @@ from topoloc.tracking.motion import (
     start_motion,
     update_motion,
 )
+
+_TRACKS = itertools.count(1)  # of all streams: one that starts anew has other numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +81,11 @@ class PoseHypotheses:
     def leader(self) -> MotionState:
         """Return the best hypothesis at the current image. Raises IndexError if there is none."""
         return self._ranked[0].current
+
+    @property
+    def track(self) -> int | None:
+        """Return the number of the best hypothesis, which its later poses keep."""
+        return self._ranked[0].track if self._ranked else None
 
     @property
     def candidate_idx(self) -> int | None:
@@ -133,6 +141,13 @@ class PoseHypotheses:
         # dropped weight counts as "elsewhere"
         self._prune(alive if self.is_track_continued or left > 0.5 else [], 1.0 - left)
         return self.best
+
+    def hold(self, t_ns: int, odom_from_cam: Rigid3 | None) -> None:
+        """Move all hypotheses to a later time, because the camera stands since the last image,
+        where odometry was `odom_from_cam`. Later motion is counted from there."""
+        for number, one in enumerate(self._ranked):
+            held = replace(one.current, t_ns=t_ns, velocity=np.zeros(6))
+            self._ranked[number] = one.measured(held, odom_from_cam)
 
     def is_consistent(
         self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
@@ -228,9 +243,8 @@ class PoseHypotheses:
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance)
                 pose, node_id = Rigid3.identity(), candidate.node_id
-                new.append(
-                    MotionHypothesis(state, odom_from_cam, state, weight, node_id, pose, number)
-                )
+                known = state, odom_from_cam, state, weight, node_id, pose, number, next(_TRACKS)
+                new.append(MotionHypothesis(*known))
         self._prune(merge_duplicates(new), self._null_weight * none**new_evidence_ratio)
         best = self.leader
         self.is_track_continued = before is not None and self.is_consistent(

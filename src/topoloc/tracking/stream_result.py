@@ -27,7 +27,12 @@ class StreamedPose(OneLine):
         smoothed: smoothed world_from_cam, from the whole stream up to this image.
         smoothed_covariance: covariance (6, 6) of its left perturbation, order (translation,
             rotation), metres and radians.
-        is_repeated: True if the image equals the preceding one and has the same result.
+        is_repeated: True if the image equals the preceding one. It is no evidence, and after a
+            second the camera is lost, unless `is_confirmed`.
+        is_confirmed: True if such an image shows that the camera stands, see
+            `tracking/repeated_images.py`. It has the result of the preceding one.
+        track: number of the hypothesis that the pose is of, None if there is none. Poses of one
+            track continue each other by the motion of the stream.
 
     The states are:
 
@@ -45,6 +50,15 @@ class StreamedPose(OneLine):
     smoothed: Rigid3 | None = None
     smoothed_covariance: Float[np.ndarray, "6 6"] | None = None
     is_repeated: bool = False
+    is_confirmed: bool = False
+    track: int | None = None
+
+    @property
+    def is_measured(self) -> bool:
+        """Return whether the pose is evidence: matched, or tracked, in an image that is no old one
+        sent again."""
+        is_old = self.is_repeated and not self.is_confirmed
+        return isinstance(self.result, Localization) and not is_old
 
     def to_json(self, query: str) -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""

@@ -24,7 +24,8 @@ from topoloc.recordings.frame import find_time_problem
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.map_stream import MapStream
-from topoloc.tracking.motion import MotionHypothesis, start_motion
+from topoloc.tracking.motion import MotionHypothesis, is_same_place, start_motion
+from topoloc.tracking.repeated_images import Repeat, RepeatedImages
 from topoloc.tracking.shared_cameras import SharedCameras
 from topoloc.tracking.stream_result import StreamedPose
 
@@ -61,7 +62,7 @@ class Tracker:
         """Discard the stream."""
         self.close()
         self._t_ns: int | None = None
-        self._image: np.ndarray | None = None
+        self._repeats = RepeatedImages(self.config.simulated)
         self._answer: StreamedPose | None = None
         self._last_search_ns = self._last_localized_ns = -_SEARCH_INTERVAL_NS
         if len(self.localizer.tile_ids) == 1:
@@ -89,7 +90,8 @@ class Tracker:
             t_ns: capture time, nanoseconds, after the preceding image. It may be equal only for the
                 same image.
             odom_from_cam: pose from external odometry, in any fixed frame. Only its change from
-                image to image is used.
+                image to image is used. An image that equals the one before confirms its place if
+                the odometry stands, too.
             max_ms: limit of all searches for this image, see `Localizer.localize`.
 
         Raises:
@@ -100,18 +102,21 @@ class Tracker:
         """
         camera = camera_of(image, camera)
         check_image_size(image, camera)
-        is_same = self._image is not None and np.array_equal(self._image, image)
+        is_same = self._repeats.is_same(image)
         self._check_time(t_ns, is_repeat_allowed=is_same)
-        if is_same and self._answer is not None:
-            return replace(
-                self._answer,
-                t_ns=t_ns,
-                result=with_time(self._answer.result, t_ns),
-                is_repeated=True,
-            )
-        self._image = image.copy()  # the caller may reuse the buffer
         limit = Deadline.from_limit(self.localizer.config.max_ms if max_ms is None else max_ms)
+        if is_same and self._answer is not None:
+            repeat = self._repeats.repeat(t_ns, odom_from_cam)
+            if repeat.fault:
+                return self._refuse_repeat(repeat, self._answer, t_ns, odom_from_cam)
+            # a second look at the same pixels may say more than the stream did, a third may not
+            if repeat.number == 2 and self._answer.state != "localized":
+                self._answer = self._look_again(self._answer, image, camera, t_ns, limit)
+            return self._confirm_repeat(self._answer, t_ns)
+        self._repeats.start(image, t_ns, odom_from_cam)
         self._answer = self._process_in_tile(image, camera, t_ns, odom_from_cam, limit)
+        is_found = self._answer.state in _LOCALIZED_STATES
+        self._repeats.learn_noise(t_ns, odom_from_cam, self._answer.smoothed if is_found else None)
         return self._answer
 
     def expect(
@@ -147,10 +152,64 @@ class Tracker:
             QueryError: the clock goes backwards or stands still.
         """
         self._check_time(t_ns)
-        self._image = None
+        self._repeats.forget_image()
         if self._stream is None:
             return StreamedPose(t_ns, "lost", self.localizer.with_provenance(result, None, t_ns))
         return self._stream.process_missing(t_ns, result, odom_from_cam)
+
+    def _refuse_repeat(
+        self, repeat: Repeat, answer: StreamedPose, t_ns: int, odom_from_cam: Rigid3 | None
+    ) -> StreamedPose:
+        """Return the result for an image that equals the one before, and is no evidence."""
+        patience = 1.0  # seconds; drivers send single images twice
+        refusal = NotLocalized("unreadable", detail=repeat.fault)
+        refusal = self.localizer.with_provenance(refusal, None, t_ns)
+        if repeat.seconds >= patience:
+            return StreamedPose(t_ns, "lost", refusal, is_repeated=True)
+        if odom_from_cam is None or self._stream is None:
+            return _repeated(answer, t_ns)
+        moved = self._stream.process_missing(t_ns, refusal, odom_from_cam)
+        return replace(moved, is_repeated=True)
+
+    def _confirm_repeat(self, answer: StreamedPose, t_ns: int) -> StreamedPose:
+        """Return the result for an image that shows that the camera stands since the one before."""
+        if self._stream is not None:
+            self._stream.hold(t_ns, self._repeats.odom_from_cam)
+        if answer.state in _LOCALIZED_STATES:
+            self._last_localized_ns = t_ns
+        return replace(_repeated(answer, t_ns), is_confirmed=True)
+
+    def _look_again(
+        self,
+        answer: StreamedPose,
+        image: Image,
+        camera: Camera | UncalibratedCamera,
+        t_ns: int,
+        limit: Deadline,
+    ) -> StreamedPose:
+        """Localize an image without the stream before it, because its repeats show that the camera
+        stands there. If that is sure, it begins a new stream: the camera was carried."""
+        least = 0.95  # probability
+        if isinstance(camera, UncalibratedCamera):
+            shared = self.cameras.known.get(camera)
+            camera = camera if shared is None else shared.camera
+        if isinstance(camera, UncalibratedCamera) or self.config.mode == "paper":
+            return answer
+        stream = None if self._stream is None else MapStream(self._stream.localizer, self.config)
+        if stream is None or len(self.localizer.tile_ids) > 1:
+            found = self.localizer.localize(image, camera, max_ms=limit, t_ns=t_ns)
+            if not isinstance(found, Localization):
+                return answer
+            if stream is None or found.provenance.tile not in stream.localizer.tile_ids:
+                stream = self._enter_tile(found.provenance.tile)
+        again = stream.process(image, camera, t_ns, self._repeats.odom_from_cam, limit)
+        result, before = again.result, answer.smoothed if answer.state == "tracked" else None
+        if not isinstance(result, Localization) or result.probability < least:
+            return answer
+        if before is not None and not is_same_place(before, result.world_from_cam):
+            return answer
+        self._stream = stream
+        return again
 
     def _process_in_tile(
         self,
@@ -201,6 +260,11 @@ class Tracker:
                 f" {self._t_ns / 1e9:.6f} s"
             )
         self._t_ns = t_ns
+
+
+def _repeated(answer: StreamedPose, t_ns: int) -> StreamedPose:
+    """Return the result of an image for one that equals it."""
+    return replace(answer, t_ns=t_ns, result=with_time(answer.result, t_ns), is_repeated=True)
 
 
 def _without_stream(result: Localization | NotLocalized, t_ns: int) -> StreamedPose:

@@ -38,6 +38,7 @@ def test_evaluate_writes_the_documented_json(
         evaluations.append(json.loads((tmp_path / f"{number}.json").read_text()))
     printed = capsys.readouterr()
     assert "false accepts" in printed.out
+    assert printed.out.count("quarter by  hardest to easiest") == 2
     assert printed.err == ""
     evaluation = evaluations[0]
     assert evaluation.keys() >= EVALUATION
@@ -55,6 +56,10 @@ def test_evaluate_writes_the_documented_json(
     page = (tmp_path / "0.html").read_text()
     assert page.startswith("<!DOCTYPE html>")
     assert page.count("<article>") == 8
+    assert "Where it is hard" in page
+    quarters = {one["by"]: one for one in evaluation["quarters"]}  # the easiest by each
+    assert quarters.keys() == {"inliers", "angle", "light"}
+    assert quarters["inliers"]["num_right"] == quarters["inliers"]["num_poses"]
 
 
 def test_a_map_from_truth_moves_the_truth(

@@ -97,6 +97,75 @@ def test_tf_is_right_through_wrong_images_darkness_and_a_kidnapping(
     assert robot.heard.statuses[-1][1] == 0
 
 
+@pytest.mark.parametrize("has_noise", [False, True])
+def test_a_robot_that_stands_is_localized(robot: PlayedRobot, room_map: Path, has_noise: bool):
+    """It stands at the start, on its way and where it was carried to. Images of a simulator are
+    equal then."""
+    robot.has_noise = has_noise
+    stop = _drive(5.0, 5.1) * 30
+    there = Step(path_pose(10.0), _picture(10.0))
+    steps = _drive(1.0, 1.1) * 20 + _drive(1.15, 5.0) + stop + _drive(5.15, 6.0)
+    kidnapped = len(steps)
+    steps += [Step(path_pose(10.0), _picture(10.0), is_carried=True), *[there] * 50]
+    steps += _drive(10.0, 12.0)
+    with followed(room_map, DOMAIN, "--ros") as process:
+        _start(robot, steps[0])
+        robot.play(steps)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+    before, after = robot.errors(0, kidnapped - 1), robot.errors(kidnapped + 30, len(steps) - 2)
+    assert before.max() < 0.1
+    assert after.max() < 0.1  # three seconds after the kidnapping
+    assert robot.pose_errors().max() < 0.1
+    texts = {text for _, _, text, _ in robot.heard.statuses}
+    assert texts <= {"localized", "the images contradict the pose"} | {
+        text for text in texts if text.startswith("no evidence for 1.")
+    }
+
+
+def test_a_camera_that_hangs_is_lost(robot: PlayedRobot, room_map: Path):
+    steps = [Step(path_pose(1.0 + 0.15 * k), _picture(1.0)) for k in range(40)]
+    robot.has_noise = False
+    with followed(room_map, DOMAIN, "--ros") as process:
+        _start(robot, steps[0])
+        robot.play(steps)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+        assert process.stderr is not None
+        (line,) = process.stderr.read().splitlines()
+    assert line.startswith("warning: the camera hangs: its images are equal while odometry moved")
+    _, level, text, _ = robot.heard.statuses[-1]
+    assert level == 2
+    assert text.startswith("the camera hangs")
+    assert len(robot.heard.poses) < 10  # none while it drives
+
+
+def test_images_without_calibration_wait_and_unknown_encodings_are_named(
+    robot: PlayedRobot, room_map: Path
+):
+    step = _drive(1.0, 1.1)[0]
+    robot.has_info = False
+    with followed(room_map, DOMAIN, "--ros") as process:
+        assert robot.wait_for_listener(START_S)
+
+        def says(words: str) -> Callable[[], bool]:
+            return lambda: any(words in text for _, _, text, _ in robot.heard.statuses[-3:])
+
+        assert robot.stand(step, says("no calibration, so the images of"), START_S)
+        robot.has_info, robot.encoding = True, "strange8"
+        assert robot.stand(step, says("pixels of encoding 'strange8'; known are"), START_S)
+        robot.encoding = None
+        assert robot.stand(step, lambda: robot.heard.statuses[-1][2] == "localized", START_S)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+        assert process.stderr is not None
+        first, second = process.stderr.read().splitlines()
+    assert first.startswith("warning: /camera/camera_info: no calibration, so the images")
+    assert "pixels of encoding 'strange8'" in second
+
+
 def test_a_camera_without_calibration_is_one_line(robot: PlayedRobot, room_map: Path):
     robot.is_calibrated = False
     with followed(room_map, DOMAIN) as process:

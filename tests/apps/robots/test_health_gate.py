@@ -88,9 +88,9 @@ def test_a_jump_is_accepted_after_a_second_of_agreeing_images(gate: HealthGate):
 def test_a_robot_that_stands_waits_longer(gate: HealthGate):
     """A robot at rest sees equal images with equal errors."""
     first = _evidence(1.0, AWAY)
-    standing = [replace(first, t_ns=first.t_ns + 200_000_000 * k) for k in range(27)]
+    standing = [replace(first, t_ns=first.t_ns + 200_000_000 * k) for k in range(12)]
     verdicts = _verdicts(gate, standing)
-    assert verdicts == "d" * 25 + "jf"
+    assert verdicts == "d" * 10 + "jf"
 
 
 def test_images_that_odometry_contradicts_confirm_no_jump(gate: HealthGate):

@@ -4,23 +4,21 @@ of an autopilot."""
 from __future__ import annotations
 
 import math
-import socket
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+import time
 
 import numpy as np
 import pytest
 
-from topoloc import Localization, StreamedPose, open_sequence
-from topoloc.apps.cli import main
+from heard_autopilot import receiver
 from topoloc.apps.robots.mavlink import (
     DroneLocalizer,
     MavlinkPublisher,
     body_of_forward_camera,
     encode_frame,
+    encode_heartbeat,
     encode_odometry,
+    read_timesync,
 )
 from topoloc.errors import TopolocError
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -111,6 +109,64 @@ def test_pymavlink_reads_them(number: int):
     assert math.isnan(message.velocity_covariance[0])
 
 
+def _crc(content: bytes, extra: int) -> bytes:
+    """Return the two bytes of CRC-16/MCRF4XX, bit by bit."""
+    crc = 0xFFFF
+    for byte in content + bytes([extra]):
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x8408 if crc & 1 else 0)
+    return crc.to_bytes(2, "little")
+
+
+@pytest.mark.parametrize("is_signed", [False, True])
+def test_requests_of_timesync_are_read_among_others(is_signed: bool):
+    request = struct.pack("<qq", 0, 1_700_000_000_123_456_789)
+    frame = bytearray(encode_frame(request, 3, 111, 34))
+    assert frame[1] == 16, "zeros at the start are sent"
+    if is_signed:
+        content = b"\xfd\x10\x01" + bytes(frame[3:-2])
+        frame = bytearray(content + _crc(content[1:], 34) + bytes(13))
+    old = b"\xfe\x10\x00\x01\x01\x6f" + request
+    old += _crc(old[1:], 34)
+    heartbeat = encode_frame(encode_heartbeat(), 4, 0, 50)
+    damaged = bytes(frame[:12]) + bytes([frame[12] ^ 1]) + bytes(frame[13:])
+    mixed = b"\x00\xfd" + heartbeat + bytes(frame) + damaged + old + heartbeat[:7]
+    ours = (0, 1_700_000_000_123_456_789)
+    assert list(read_timesync(mixed)) == [ours, ours]
+
+
+def test_pymavlink_reads_heartbeat_and_timesync():
+    common = pytest.importorskip(
+        "pymavlink.dialects.v20.common", reason="pymavlink (LGPL) is not installed"
+    )
+    link = common.MAVLink(None)
+    beat = link.decode(bytearray(encode_frame(encode_heartbeat(), 0, 0, 50)))
+    assert (beat.get_type(), beat.type, beat.autopilot) == ("HEARTBEAT", 18, 8)
+    assert (beat.system_status, beat.mavlink_version) == (4, 3)
+    request = common.MAVLink_timesync_message(0, 5_000_000_007).pack(link)
+    assert list(read_timesync(bytes(request))) == [(0, 5_000_000_007)]
+    assert bytes(request)[:7].hex()[:2] == "fd"
+
+
+def test_timesync_is_answered_and_heartbeats_are_sent():
+    """The answer has the clock of the images: nanoseconds since 1970."""
+    with receiver() as autopilot:
+        drone = DroneLocalizer(f"udpout:127.0.0.1:{autopilot.getsockname()[1]}", print)
+        beat, sender = autopilot.recvfrom(300)
+        before_ns = time.time_ns()
+        autopilot.sendto(encode_frame(struct.pack("<qq", 0, 77), 0, 111, 34), sender)
+        (answer,) = read_timesync(autopilot.recv(300))
+        # an answer to somebody else's request is no request
+        autopilot.sendto(encode_frame(struct.pack("<qq", 5, 77), 1, 111, 34), sender)
+        after = autopilot.recv(300)
+        drone.close()
+    assert beat == encode_frame(encode_heartbeat(), 0, 0, 50)
+    assert answer[1] == 77
+    assert before_ns <= answer[0] <= time.time_ns()
+    assert after[7:10] == bytes(3)  # the next HEARTBEAT
+
+
 def _sent(pose: Rigid3, covariance: np.ndarray | None = None) -> tuple[np.ndarray, Rigid3]:
     """Return the covariance and the pose (forward, right, down) that an autopilot reads."""
     payload = encode_odometry(0, pose, _NONE if covariance is None else covariance, 0.5, 0)
@@ -174,20 +230,12 @@ def test_quality_is_the_percentage_and_0_is_unknown(p: float | None, quality: in
     assert encode_odometry(0, Rigid3.identity(), _NONE, p, 0)[-1] == quality
 
 
-@contextmanager
-def _receiver() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(10.0)
-        yield receiver
-
-
 def test_poses_are_sent_and_jumps_are_counted():
-    with _receiver() as receiver:
-        publisher = MavlinkPublisher(f"udpout:localhost:{receiver.getsockname()[1]}")
+    with receiver() as heard:
+        publisher = MavlinkPublisher(f"udpout:localhost:{heard.getsockname()[1]}")
         for number, is_reset in enumerate((False, True, False, True)):
             publisher.publish(1000 * number, Rigid3.identity(), _NONE, 0.9, is_reset)
-        frames = [receiver.recv(300) for _ in range(4)]
+        frames = [heard.recv(300) for _ in range(4)]
         publisher.close()
     expected = [
         encode_frame(encode_odometry(1000 * number, Rigid3.identity(), _NONE, 0.9, resets), number)
@@ -197,14 +245,14 @@ def test_poses_are_sent_and_jumps_are_counted():
 
 
 def test_an_own_port_sends_to_its_clients():
-    with _receiver() as free:
+    with receiver() as free:
         port = free.getsockname()[1]
     publisher = MavlinkPublisher(f"udpin:127.0.0.1:{port}")
     publisher.publish(0, Rigid3.identity(), _NONE, 0.9)  # no receiver is connected yet
-    with _receiver() as receiver:
-        receiver.sendto(b"\xfd", ("127.0.0.1", port))
+    with receiver() as heard:
+        heard.sendto(b"\xfd", ("127.0.0.1", port))
         publisher.publish(1000, Rigid3.identity(), _NONE, 0.9)
-        assert receiver.recv(300)[4] == 1, "the second frame"
+        assert heard.recv(300)[4] == 1, "the second frame"
     with pytest.raises(TopolocError, match=f"^udpin:127.0.0.1:{port}: [^\n]*in use; name another"):
         MavlinkPublisher(f"udpin:127.0.0.1:{port}")
     publisher.close()
@@ -223,61 +271,3 @@ def test_an_invalid_address_is_one_sentence(address: str):
 def test_a_host_that_is_unknown_is_named():
     with pytest.raises(TopolocError, match=r"^udpout:nowhere\.invalid:14550: "):
         MavlinkPublisher("udpout:nowhere.invalid:14550")
-
-
-def _received(receiver: socket.socket) -> list[tuple[int, np.ndarray, int]]:
-    """Return time (microseconds), position (forward, right, down) and reset counter of each
-    received message."""
-    receiver.settimeout(0.3)
-    found = []
-    with suppress(TimeoutError):
-        while True:
-            payload = receiver.recv(300)[10:-2].ljust(233, b"\0")
-            fields = struct.unpack("<Q55f4Bb", payload)
-            found.append((fields[0], np.array(fields[1:4]), fields[-3]))
-    return found
-
-
-def _answer(t_ns: int, x: float, probability: float = 0.95) -> StreamedPose:
-    pose = _pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), x, 0.0, 1.0)
-    result = Localization(pose, 1e-4 * np.eye(6), probability, 0, [], 90, 80, {"total": 9.0})
-    return StreamedPose(t_ns, "localized", result, pose, 1e-4 * np.eye(6))
-
-
-def test_a_jump_is_sent_once_three_images_agree_on_it():
-    warnings = list[str]()
-    with _receiver() as receiver:
-        drone = DroneLocalizer(f"udpout:127.0.0.1:{receiver.getsockname()[1]}", warnings.append)
-        xs = [0.0, 0.1, 0.2, 0.3, 20.0, 0.4, 20.0, 20.1, 20.2, 20.3]
-        for number, x in enumerate(xs):
-            drone.take(_answer(100_000_000 * number, x, 0.5 if number == 9 else 0.95))
-        found = _received(receiver)
-        drone.close()
-    sent = {(t_us // 100_000, round(float(at[0]), 3), resets) for t_us, at, resets in found}
-    assert sent == {(2, 0.2, 0), (3, 0.3, 0), (5, 0.4, 0), (8, 20.2, 1)}
-    assert warnings == []
-
-
-def test_a_pose_is_repeated_while_it_is_new():
-    with _receiver() as receiver:
-        drone = DroneLocalizer(f"udpout:127.0.0.1:{receiver.getsockname()[1]}", print)
-        for number in range(3):
-            drone.take(_answer(number, 0.0))
-        found = _received(receiver)
-        drone.close()
-    assert 3 <= len(found) <= 8
-    assert {t_us for t_us, *_ in found} == {0}
-
-
-def test_follow_sends_localized_poses(room_map: Path, tiny_recording: Path):
-    sequence = open_sequence(tiny_recording)
-    with _receiver() as receiver:
-        address = f"udpout:127.0.0.1:{receiver.getsockname()[1]}"
-        assert main(["follow", str(room_map), str(tiny_recording), "--mavlink", address]) == 0
-        found = {t_us: at for t_us, at, _ in _received(receiver)}
-    truth = {t_ns // 1000: pose for t_ns, pose in zip(sequence.t_ns, sequence.poses, strict=True)}
-    assert len(found) >= 10
-    for t_us, at in found.items():
-        pose = truth[t_us]
-        assert pose is not None
-        assert np.linalg.norm(at * [1.0, -1.0, -1.0] - pose.translation) < 0.03

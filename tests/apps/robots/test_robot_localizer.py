@@ -202,6 +202,8 @@ def test_poses_without_evidence_are_not_published(make: Callable[..., Robot]):
         robot.see(number + 3, state="tracked", wrong=away)
     assert len(robot.published.poses) == shown
     assert np.allclose(robot.published.transforms[-1][2].matrix(), MAP_FROM_ODOM.matrix())
+    robot.see(62, is_repeated=True, is_confirmed=True)  # the robot stands
+    assert len(robot.published.poses) == shown + 1
 
 
 def test_the_gate_holds_after_images_without_tf(make: Callable[..., Robot]):
@@ -243,6 +245,9 @@ def test_missing_tf_is_one_warning_and_an_error_of_diagnostics(make: Callable[..
     robot = make(base_frame="base_footprint")
     for number in range(4):
         robot.see(number)
+    assert robot.warnings == []  # it may be starting
+    time.sleep(robot.localizer.patience)
+    robot.see(4)
     (line,) = robot.warnings
     assert "no frame base_footprint in TF" in line
     assert robot.published.poses == []

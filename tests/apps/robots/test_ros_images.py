@@ -176,14 +176,67 @@ def test_missing_messages_are_named(monkeypatch: pytest.MonkeyPatch):
     now = iter(np.arange(0.0, 1e4, 0.5))
     monkeypatch.setattr(ros_images.time, "monotonic", lambda: float(next(now)))
     images, node, warnings = _open([_image(1)], info=_info())
-    node.queues["/camera/camera_info"].batches = []
+    node.queues["/camera/camera_info"].batches = [*[[]] * 20, [_info()]]
     (frame,) = islice(images.frames(threading.Event()), 1)
-    with pytest.raises(CalibrationError, match="no calibration for 5 s; publish it, or give"):
-        frame.read()
+    assert frame.read().camera is not None  # it has waited
     node.queues["/camera/image_raw"].batches = [*[[]] * 60, [_image(2)]]
     assert len(list(islice(images.frames(threading.Event()), 1))) == 1
-    (line,) = warnings
-    assert line.startswith("/camera/image_raw: no image for 10 s in ROS domain 0")
+    assert [line[:60] for line in warnings] == [
+        "/camera/camera_info: no calibration, so the images of /camer",
+        "/camera/image_raw: no image for 10 s in ROS domain 0; check ",
+    ]
+    assert images.fault is None
+
+
+def test_an_image_that_waits_for_its_calibration_says_so(monkeypatch: pytest.MonkeyPatch):
+    now, stop = iter(np.arange(0.0, 1e4, 0.5)), threading.Event()
+    monkeypatch.setattr(ros_images.time, "monotonic", lambda: float(next(now)))
+    images, node, warnings = _open(*[[_image(t)] for t in range(1, 20)], info=_info())
+    node.queues["/camera/camera_info"].batches = []
+    monkeypatch.setattr(stop, "wait", lambda seconds: images.fault and stop.set())
+    assert list(images.frames(stop)) == []
+    assert warnings == [images.fault]
+    assert images.fault == (
+        "/camera/camera_info: no calibration, so the images of /camera/image_raw wait; publish it,"
+        " or give --camera FILE"
+    )
+
+
+def _smooth(width: int = 64, height: int = 48) -> np.ndarray:
+    """Return a picture of a smooth scene with noise."""
+    rng = np.random.default_rng(1)
+    rough = cv2.resize(rng.integers(0, 255, (6, 8, 3)).astype(np.uint8), (width, height))
+    return np.clip(rough + rng.normal(0.0, 2.0, rough.shape), 0, 255).astype(np.uint8)
+
+
+def _yuv(label: str, is_yuyv: bool) -> SimpleNamespace:
+    picture = _smooth()
+    y, u, v = cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV))
+    chroma = np.where(np.arange(u.shape[1]) % 2 == 0, u, v)
+    planes = np.dstack([y, chroma] if is_yuyv else [chroma, y])
+    return SimpleNamespace(
+        header=_header(1), height=48, width=64, encoding=label, is_bigendian=0,
+        step=128, data=planes.tobytes(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("label", "is_yuyv"), [("yuv422", True), ("yuv422_yuy2", False)])
+def test_the_order_of_bytes_is_that_of_the_pixels(label: str, is_yuyv: bool):
+    images, _, warnings = _open([_yuv(label, is_yuyv)], [_yuv(label, is_yuyv)])
+    for frame in islice(images.frames(threading.Event()), 1):
+        assert np.abs(frame.read().image.astype(int) - _smooth()).mean() < 20.0
+    assert warnings == [images.notes["pixel_order"]]
+    assert warnings[0].startswith(
+        f"the bytes of /camera/image_raw are in another order than {label} says"
+    )
+
+
+@pytest.mark.parametrize(("label", "is_yuyv"), [("yuv422", False), ("yuv422_yuy2", True)])
+def test_right_labels_are_trusted(label: str, is_yuyv: bool):
+    images, _, warnings = _open([_yuv(label, is_yuyv)])
+    (frame,) = islice(images.frames(threading.Event()), 1)
+    assert np.abs(frame.read().image.astype(int) - _smooth()).mean() < 20.0
+    assert (warnings, images.notes) == ([], {})
 
 
 @pytest.mark.parametrize("topic", ["", "/", "/a b", "/camera//image", "/1st", "/a" * 3 + "/"])

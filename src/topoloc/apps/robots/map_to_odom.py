@@ -3,7 +3,8 @@
 Only images that were matched with the map are evidence, never poses predicted by odometry. A pose
 that agrees with the present transform updates it. Poses that contradict it must agree among each
 other, by the motion that odometry measured between them, before they replace it (a jump). The
-published transform moves smoothly, or at once.
+published transform moves smoothly, or at once. Poses of a camera without odometry must continue
+each other instead.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import Float
 
-from topoloc import Rigid3
+from topoloc import NotLocalized, Rigid3, StreamedPose
 
 Verdict = Literal["found", "jumped", "doubted"]
 
@@ -109,7 +110,7 @@ class HealthGate:
         if len(self._against) < self._num_confirming or self.agreed is None:
             return len(self._against) >= self._num_confirming
         # Images of a robot that stands (metres and radians) have the same errors.
-        still, moving_s, standing_s = 0.1, 1.0, 5.0
+        still, moving_s, standing_s = 0.1, 1.0, 2.0
         is_still = bool(np.all(last.travelled - first.travelled < still))
         seconds = standing_s if is_still else moving_s
         return last.t_ns - first.t_ns >= seconds * 1e9
@@ -133,43 +134,97 @@ class HealthGate:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class StreamPose:
+    """Hold the pose of an image in a stream without odometry from outside.
+
+    Attributes:
+        sigma: standard deviation of the position, metres.
+        track: that of `StreamedPose`.
+    """
+
+    t_ns: int
+    map_from_cam: Rigid3
+    sigma: float
+    track: int | None
+
+
 class ContinuityGate:
-    """Decide which poses of a camera without odometry are published, by how fast it can move.
+    """Decide which poses of a camera without odometry are published. A pose must continue those
+    before it: by their velocity, and by the acceleration that the camera may have.
 
     Args:
-        num_confirming: successive images that must agree on a first pose or a jump.
+        num_confirming: successive images that must agree on a first pose, after a loss and on a
+            jump.
     """
+
+    max_gap: ClassVar[float] = 2.0
+    """Seconds without a pose after which the next one does not continue it."""
 
     def __init__(self, num_confirming: int = 3) -> None:
         self._num_confirming = num_confirming
-        self._agreed: tuple[int, Rigid3] | None = None
-        self._against: list[tuple[int, Rigid3]] = []
+        self._agreed, self._against = list[StreamPose](), list[StreamPose]()
+        self._is_broken = self._is_refuted = False
 
     @property
     def is_contradicted(self) -> bool:
         """Return whether the last images contradict the agreed pose."""
         return bool(self._against)
 
-    def judge(self, t_ns: int, map_from_cam: Rigid3) -> Verdict:
+    def observe(self, answer: StreamedPose) -> None:
+        """Take the answer for any image. After a loss, a jump or an ambiguity of the stream images
+        must agree anew. A pose of another track is then no continuation of the last one, unless
+        that had ended for lack of images."""
+        end = 1.0  # seconds without images after which streams end
+        result, is_unclear = answer.result, answer.state == "ambiguous"
+        is_jump = isinstance(result, NotLocalized) and result.reason == "jump"
+        self._is_broken |= is_jump or is_unclear or answer.state == "lost"
+        if self._agreed:
+            gap = (answer.t_ns - self._agreed[-1].t_ns) / 1e9
+            self._is_refuted |= is_jump or (is_unclear and gap <= end)
+
+    def judge(self, seen: StreamPose) -> Verdict:
         """Take the pose of an image, see `HealthGate.judge`."""
-        measured = t_ns, map_from_cam
-        if self._agreed is not None and _can_follow(self._agreed, measured):
-            self._agreed, self._against = measured, []
-            return "found"
-        if self._against and not _can_follow(self._against[-1], measured):
+        if self._agreed and not self._is_broken and self._continues(self._agreed, seen):
+            return self._agree([*self._agreed, seen], "found")
+        if self._against and not self._continues(self._against, seen):
             self._against = []
-        self._against.append(measured)
+        self._against.append(seen)
         if len(self._against) < self._num_confirming:
             return "doubted"
-        self._agreed, self._against = measured, []
-        return "jumped"
+        first, last = self._against[0], self._agreed[-1] if self._agreed else None
+        is_same = last is not None and not (self._is_refuted and first.track != last.track)
+        is_same = is_same and self._continues(self._agreed, first)
+        return self._agree(self._against, "found" if is_same else "jumped")
 
+    def _agree(self, poses: list[StreamPose], verdict: Verdict) -> Verdict:
+        span_ns = 500_000_000  # over which velocity is measured
+        newest = poses[-1].t_ns
+        kept = [one for one in poses if newest - one.t_ns <= span_ns]
+        self._agreed, self._against = kept if len(kept) > 1 else poses[-2:], []
+        self._is_broken = self._is_refuted = False
+        return verdict
 
-def _can_follow(before: tuple[int, Rigid3], after: tuple[int, Rigid3]) -> bool:
-    """Return whether a camera can have come from one pose to the other."""
-    least_m, speed, least_rad, turn = 0.3, 5.0, 0.3, 3.0  # metres per second, radians per second
-    seconds = max(after[0] - before[0], 0) / 1e9
-    return after[1].is_same(before[1], least_m + speed * seconds, least_rad + turn * seconds)
+    def _continues(self, before: list[StreamPose], after: StreamPose) -> bool:
+        """Return whether a camera that was at some poses can be at another one later."""
+        first, last = before[0], before[-1]
+        seconds, span = (after.t_ns - last.t_ns) / 1e9, (last.t_ns - first.t_ns) / 1e9
+        if seconds > self.max_gap:
+            return False
+        least_rad, turn = 0.3, 3.0  # radians, radians per second
+        if span <= 0.0:  # of unknown velocity
+            least_m, speed = 0.3, 5.0
+            metres = least_m + speed * seconds
+            return after.map_from_cam.is_same(last.map_from_cam, metres, least_rad + turn * seconds)
+        velocity = (last.map_from_cam.translation - first.map_from_cam.translation) / span
+        predicted = Rigid3(
+            last.map_from_cam.rotation, last.map_from_cam.translation + velocity * seconds
+        )
+        # two sigma of the motion model of streams, and of both poses: most of their errors are one
+        least_m, most_m, acceleration = 0.15, 0.25, 6.0
+        metres = least_m + min(2.0 * math.hypot(last.sigma, after.sigma), most_m)
+        metres += 0.5 * acceleration * seconds**2
+        return after.map_from_cam.is_same(predicted, metres, least_rad + turn * seconds)
 
 
 class MapToOdom:

@@ -35,6 +35,11 @@ class RobotClock:
         self._delays_ns.append(self._local_ns() - t_ns)
 
     @property
+    def is_waiting(self) -> bool:
+        """Return whether no time has come on /clock yet."""
+        return self._is_simulated and not self._simulated_ns
+
+    @property
     def offset(self) -> float:
         """Return the seconds that this clock is ahead of the stamps, with the shortest delay."""
         return min(self._delays_ns, key=abs) / 1e9 if self._delays_ns else 0.0
@@ -52,7 +57,7 @@ class RobotClock:
 
     def describe_fault(self) -> str | None:
         """Return what is wrong with the clock, in one sentence, or None."""
-        if self._is_simulated and not self._simulated_ns:
+        if self.is_waiting:
             return "no time on /clock; start the simulation, or leave out use_sim_time"
         if not self.is_foreign:
             return None
@@ -79,6 +84,12 @@ class Health:
     num_dropped: int = 0
     num_jumps: int = 0
     faults: dict[str, str] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def is_blind(self) -> bool:
+        """Return whether no image can be used, and the stream has ended."""
+        return self.state == "lost" and "image" in self.faults
 
     def judge(self, now: float) -> tuple[int, str]:
         """Return the level (0 OK, 1 WARN, 2 ERROR) and a sentence."""
@@ -88,7 +99,7 @@ class Health:
         fault = faults[0] if faults else None
         if math.isinf(silence):
             return error, fault or "not localized yet"
-        if silence > lost_after:
+        if silence > lost_after or self.is_blind:
             return error, fault or f"lost: no evidence for {silence:.1f} s"
         if fault is not None:
             return warn, fault
@@ -109,4 +120,4 @@ class Health:
             "evidence_age_s": f"{now - self.evidence_at:.2f}",
             "clock_offset_s": f"{offset:.3f}",
             "jumps": f"{self.num_jumps}",
-        }
+        } | self.notes

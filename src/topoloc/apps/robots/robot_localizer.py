@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from topoloc import Localization, Rigid3, StreamedPose, Tracker
+from topoloc import Localization, NotLocalized, Rigid3, StreamedPose, Tracker
 from topoloc.apps.cli.queries.query_answers import QueryAnswer, QueryFrame
 from topoloc.apps.formats.bags.bag_poses import pose_of_transform
 from topoloc.apps.formats.bags.messages import frame_id, stamp_ns, stamped_transform
@@ -24,12 +24,19 @@ from topoloc.apps.robots.map_to_odom import (
     HealthGate,
     MapToOdom,
     MeasuredPose,
+    StreamPose,
     project_to_plane,
     tilt,
 )
 from topoloc.apps.robots.robot_health import Health, RobotClock
 from topoloc.apps.robots.ros_images import RosImages
-from topoloc.apps.robots.ros_node import INITIAL_POSE_TOPIC, RobotPublisher, RosNode, Uncertain
+from topoloc.apps.robots.ros_node import (
+    INITIAL_POSE_TOPIC,
+    RobotPublisher,
+    RosNode,
+    Uncertain,
+    covariance_about,
+)
 from topoloc.apps.robots.transform_buffer import TransformBuffer, TransformError
 
 
@@ -57,6 +64,8 @@ class RobotLocalizer:
     """Transforms per second, between the images too."""
     transform_tolerance: ClassVar[float] = 0.2
     """Seconds by which transforms are stamped ahead."""
+    patience: ClassVar[float] = 2.0
+    """Seconds for which TF, or /clock at the start, may be missing without a complaint."""
 
     def __init__(
         self,
@@ -75,6 +84,8 @@ class RobotLocalizer:
         self._odometry: OdometryPose | None = None  # of the last image that had one
         self._user_pose: Any = None
         self._last_ns = self._last_stamp_ns = 0
+        self._started_at: float | None = None  # the first image
+        self._had_tf_at = 0.0  # that image, or the last one with TF
         self._rival_at = -math.inf  # when another node published map to odom
         self._sent_ns = deque[int](maxlen=200)  # the stamps of its own transforms
         self._warned = set[str]()
@@ -98,6 +109,8 @@ class RobotLocalizer:
             self._reset(frame.t_ns)
             tracker.reset()
         self._last_ns = frame.t_ns
+        if self._started_at is None:
+            self._started_at = self._had_tf_at = time.monotonic()
         self._report("load", self._images and self._images.describe_load())
         odometry = self._find_odometry(frame.t_ns)
         if odometry is not None:
@@ -106,6 +119,7 @@ class RobotLocalizer:
                 tracker.expect(*prior, frame.t_ns, odometry.odom_from_cam)
         answer = frame.localize(tracker.cameras, tracker, camera_of_size)
         if answer.streamed is not None:
+            self._report("image", _describe_image(answer.streamed))
             self._publish(answer.streamed, odometry)
         return answer
 
@@ -152,7 +166,7 @@ class RobotLocalizer:
             self._map_to_odom.reset()
             self._transforms.forget_after(t_ns)
             self._clock.reset()
-            self._odometry, self._last_stamp_ns = None, 0
+            self._odometry, self._last_stamp_ns, self._started_at = None, 0, None
 
     def _find_odometry(self, t_ns: int) -> OdometryPose | None:
         """Return the odometry at the time of an image, None if there is none."""
@@ -160,10 +174,12 @@ class RobotLocalizer:
         if not config.has_odometry:
             return None
         self._clock.observe(t_ns)
-        self._report("clock", self._clock.describe_fault())
+        now = time.monotonic()
+        is_early = now - (self._started_at or 0.0) < self.patience and self._clock.is_waiting
+        self._report("clock", None if is_early else self._clock.describe_fault())
         text = f"another node publishes TF to {config.odom_frame}; stop it, or name the frames"
         seconds = 2.0  # it is reported for so long
-        is_rival = time.monotonic() - self._rival_at < seconds
+        is_rival = now - self._rival_at < seconds
         self._report("rival", text if is_rival else None)
         camera = (self._images and self._images.frame_id) or config.camera_frame
         patience = 0.1  # seconds for the transforms at the time of the image
@@ -173,9 +189,10 @@ class RobotLocalizer:
                 for target in (config.odom_frame, config.base_frame)
             )
         except TransformError as error:
-            self._report("tf", str(error))
+            self._report("tf", None if now - self._had_tf_at < self.patience else str(error))
             return None
         self._report("tf", None)
+        self._had_tf_at = now
         travelled = np.zeros(2)
         if before is not None:
             motion = before.odom_from_cam.inverse() @ odom_from_cam
@@ -207,9 +224,12 @@ class RobotLocalizer:
         pose, health.probability = self._measured_pose(answer)
         health.state = answer.state
         health.num_dropped = 0 if self._images is None else self._images.num_dropped
+        self._camera_gate.observe(answer)
         if pose is not None and health.probability >= self._gate.min_probability:
             if not self._config.has_odometry:
-                if self._camera_gate.judge(answer.t_ns, pose[0]) != "doubted":
+                sigma = float(np.sqrt(np.trace(covariance_about(*pose)[:3, :3])))
+                seen = StreamPose(answer.t_ns, pose[0], sigma, answer.track)
+                if self._camera_gate.judge(seen) != "doubted":
                     self._publish_camera(answer.t_ns, *pose)
             elif odometry is not None:
                 is_localized = answer.state == "localized"
@@ -221,9 +241,9 @@ class RobotLocalizer:
 
     def _measured_pose(self, answer: StreamedPose) -> tuple[Uncertain | None, float]:
         """Return map_from_cam and its probability. None of a pose that is only predicted, or of an
-        image that a camera repeats."""
+        image that a camera repeats while it hangs."""
         result = answer.result
-        if not isinstance(result, Localization) or answer.is_repeated:
+        if not (isinstance(result, Localization) and answer.is_measured):
             return None, 0.0
         pose, covariance = result.world_from_cam, result.covariance
         if answer.smoothed is not None and answer.smoothed_covariance is not None:
@@ -281,12 +301,23 @@ class RobotLocalizer:
         interval, due, before = 1.0, 0.0, None  # seconds between diagnostics of one level
         while not self._is_closed.wait(1.0 / self.rate):
             self._send_map_to_odom()
+            if self._images is not None:
+                self._take_faults(self._images)
             now = time.monotonic()
             level, text = self._health.judge(now)
             if now >= due or level != before:
                 due, before = now + interval, level
                 values = self._health.values(now, self._clock.offset)
                 self._publisher.send_status(self._clock.now_ns(), level, text, values)
+
+    def _take_faults(self, images: RosImages) -> None:
+        """Take what the topic of the images says, also while it gives none."""
+        faults = self._health.faults
+        if images.fault is None:
+            faults.pop("topic", None)
+        else:
+            faults["topic"] = images.fault
+        self._health.notes = images.notes
 
     def _report(self, kind: str, text: str | None) -> None:
         """Take or remove a fault of a kind. The first of a kind is a warning as well."""
@@ -297,6 +328,16 @@ class RobotLocalizer:
         if kind not in self._warned:
             self._warned.add(kind)
             self._warn(text)
+
+
+def _describe_image(answer: StreamedPose) -> str | None:
+    """Return why an image cannot be used: it is damaged, of an unknown encoding, or sent again and
+    again. A driver may send one twice."""
+    result = answer.result
+    is_twice = answer.is_repeated and answer.state != "lost"
+    if isinstance(result, NotLocalized) and result.reason == "unreadable" and not is_twice:
+        return result.detail
+    return None
 
 
 def _make_evidence(

@@ -97,3 +97,35 @@ def test_options_of_robots_need_ros(complaint: Callable[..., str], room_map: Pat
     assert "--odom needs --ros" in complaint("follow", room_map, "0", "--odom", "none", status=2)
     frame = ("--base-frame", "base_footprint")
     assert "--base-frame needs --ros" in complaint("follow", room_map, "0", *frame, status=2)
+
+
+def _still_recording(tiny_recording: Path, folder: Path) -> Path:
+    """Write a recording of a camera whose images are equal, ten per second for three seconds."""
+    picture = min((tiny_recording / "image_0").iterdir()).read_bytes()
+    (folder / "images").mkdir(parents=True)
+    for number in range(30):
+        (folder / "images" / f"{number:06d}.png").write_bytes(picture)
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.9f}\n" for k in range(30)))
+    (folder / "camera.json").write_bytes((tiny_recording / "camera.json").read_bytes())
+    return folder
+
+
+def test_equal_images_are_no_evidence_unless_they_are_simulated(
+    room_map: Path, tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    still = _still_recording(tiny_recording, tmp_path / "still")
+    assert main(["follow", str(room_map), str(still)]) == 0
+    out, said = capsys.readouterr()
+    states = [json.loads(line)["state"] for line in out.splitlines()]
+    assert states == ["localized"] * 10 + ["lost"] * 20
+    assert said == (
+        f"warning: {still}: the images are equal: the camera hangs, or stands in a simulator"
+        " without noise; restart its driver, or for a simulator give --simulated of `follow`"
+        " (setting track.simulated)\n"
+    )
+    assert main(["follow", str(room_map), str(still), "--simulated"]) == 0
+    out, said = capsys.readouterr()
+    answers = [json.loads(line) for line in out.splitlines()]
+    assert [one["state"] for one in answers] == ["localized"] * 30
+    assert all(one["covariance"] == answers[0]["covariance"] for one in answers)
+    assert said == ""

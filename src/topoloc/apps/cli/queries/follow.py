@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from itertools import chain, pairwise
 from typing import Annotated
 
 import numpy as np
 import tyro
 
-from topoloc import AtlasConfig, Localizer, LocalizerConfig, StereoSequence, Tracker, TrackerConfig
+from topoloc import (
+    AtlasConfig,
+    Localizer,
+    LocalizerConfig,
+    NotLocalized,
+    StereoSequence,
+    StreamedPose,
+    Tracker,
+    TrackerConfig,
+)
 from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
     File,
@@ -30,7 +42,7 @@ from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.core_names import as_monocular
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.config import RobotConfig
-from topoloc.apps.robots.mavlink import DroneLocalizer
+from topoloc.apps.robots.mavlink import DroneLocalizer, choose_origin
 from topoloc.apps.robots.robot_localizer import RobotLocalizer
 from topoloc.apps.robots.ros_images import RosImages, is_topic
 from topoloc.apps.robots.ros_node import RosNode
@@ -57,6 +69,11 @@ class Command:
     """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     plain: Flag = False
     """Print readable lines instead of JSON."""
+    realtime: Flag = False
+    """Play a recording at its own pace, with this machine's times. Late images are left out."""
+    simulated: Flag = False
+    """The images are of a simulator without noise: equal ones show that the camera stands. With
+    odometry this is found."""
     ros: Flag = False
     """Localize a robot of ROS 2: publish TF from map to odom, /topoloc/pose and /diagnostics in the
     domain ROS_DOMAIN_ID."""
@@ -79,7 +96,7 @@ class Command:
     """With --ros: publish the first confirmed pose on /initialpose, instead of reading it."""
     mavlink: Annotated[str | None, option("udpout:HOST:PORT")] = None
     """Send the poses to an autopilot, as ODOMETRY of a drone whose camera looks ahead. Or
-    `udpin:HOST:PORT`, to whoever writes to this port."""
+    `udpin:HOST:PORT`, to whoever writes to this port. Give --realtime with a recording."""
     config: File = None
     """TOML file with all other settings, as printed by `topoloc config follow`."""
 
@@ -88,10 +105,14 @@ class Command:
         localizer = open_localizer(
             self.map, settings.get(LocalizerConfig), self.features, settings.get(AtlasConfig)
         )
+        if self.realtime and (is_topic(self.source) or is_live(self.source)):
+            raise UsageError("--realtime plays a recording; leave it out for a live camera")
         if self.ros or self.mavlink is not None:
             self._check_world(localizer)
+        tracking = settings.get(TrackerConfig)
+        tracking = replace(tracking, simulated=self.simulated or tracking.simulated)
         with ExitStack() as stack:
-            tracker = stack.enter_context(closing(Tracker(localizer, settings.get(TrackerConfig))))
+            tracker = stack.enter_context(closing(Tracker(localizer, tracking)))
             stop = stack.enter_context(catch_stop_signals())
             of_size = None if self.camera is None else parse_camera(localizer, self.camera)
             config, node, images = self._robot_config(settings.get(RobotConfig)), None, None
@@ -100,19 +121,18 @@ class Command:
             if node is not None and is_topic(self.source):
                 images = RosImages(node, self.source, of_size is not None, print_warning)
                 frames = images.frames(stop)
-            elif is_live(self.source):
-                frames = capture_frames(stack.enter_context(LiveSource(self.source)), stop)
             else:
-                recording = open_recording(self.source, self.format, None, self.topics)
-                frames = _read_frames(as_monocular(recording))
+                frames = self._open_frames(stack, stop)
             robot = None
             if node is not None and self.ros:
                 robot = RobotLocalizer(node, config, images, print_warning)
                 stack.enter_context(closing(robot))
             drone = None
             if self.mavlink is not None:
-                drone = stack.enter_context(closing(DroneLocalizer(self.mavlink, print_warning)))
-            last_ns = 0
+                origin = self._choose_origin(localizer)
+                drone = DroneLocalizer(self.mavlink, print_warning, origin)
+                stack.enter_context(closing(drone))
+            last_ns, has_warned = 0, robot is not None  # the robot does so itself
             for frame in frames:
                 if stop.is_set():
                     break
@@ -123,10 +143,21 @@ class Command:
                     answer = frame.localize(tracker.cameras, tracker, of_size)
                 else:
                     answer = robot.localize(frame, tracker, of_size)
+                if not has_warned and (fault := _describe_hang(answer.streamed)):
+                    has_warned = True
+                    print_warning(f"{self.source}: {fault}")
                 if drone is not None and answer.streamed is not None:
                     drone.take(answer.streamed)
                 print_line(format_answer(answer) if self.plain else json.dumps(answer.to_json()))
         return 0
+
+    def _open_frames(self, stack: ExitStack, stop: threading.Event) -> Iterator[QueryFrame]:
+        """Return the images of a camera or a recording."""
+        if is_live(self.source):
+            return capture_frames(stack.enter_context(LiveSource(self.source)), stop)
+        recording = open_recording(self.source, self.format, None, self.topics)
+        frames = _read_frames(as_monocular(recording))
+        return _play(frames, stop) if self.realtime else frames
 
     def _check_world(self, localizer: Localizer) -> None:
         """Warn if z of the map does not point up. Raises UsageError: it has several worlds."""
@@ -139,6 +170,19 @@ class Command:
                 f"{self.map}: z does not point up in this map, as robots expect; `topoloc level"
                 f" {self.map}` makes it so"
             )
+
+    def _choose_origin(self, localizer: Localizer) -> np.ndarray | None:
+        """Return the point that is sent as 0, and say so, if the map is far from its own."""
+        places = [one.world_from_cam.translation for one in localizer.topomap.summaries]
+        origin = choose_origin(np.reshape(places, (-1, 3)))
+        if origin is not None:
+            x, y, z = origin
+            print_warning(
+                f"{self.map}: positions are sent relative to {x:.0f},{y:.0f},{z:.0f} m of its"
+                " world, because MAVLink's numbers of 32 bits cannot hold them; set the autopilot's"
+                " origin there"
+            )
+        return origin
 
     def _robot_config(self, config: RobotConfig) -> RobotConfig:
         if not self.ros:
@@ -172,3 +216,25 @@ def _read_frames(sequence: StereoSequence) -> Iterator[QueryFrame]:
     """Yield the images of a recording with its own times."""
     for index, (name, t_ns) in enumerate(zip(sequence.names, sequence.t_ns, strict=True)):
         yield QueryFrame(name, t_ns, lambda index=index: sequence[index])
+
+
+def _play(frames: Iterator[QueryFrame], stop: threading.Event) -> Iterator[QueryFrame]:
+    """Yield images when they are due by this machine's clock, with its times, until `stop`. One
+    whose next is due is left out."""
+    offset_ns: int | None = None
+    for frame, after in pairwise(chain(frames, [None])):
+        if frame is None or stop.is_set():
+            return
+        now_ns = time.time_ns()
+        offset_ns = now_ns - frame.t_ns if offset_ns is None else offset_ns
+        if after is not None and after.t_ns + offset_ns <= now_ns:
+            continue
+        stop.wait(max(frame.t_ns + offset_ns - now_ns, 0) / 1e9)
+        yield replace(frame, t_ns=frame.t_ns + offset_ns)
+
+
+def _describe_hang(answer: StreamedPose | None) -> str | None:
+    """Return why images that equal each other end a stream."""
+    if answer is None or not answer.is_repeated or answer.state != "lost":
+        return None
+    return answer.result.detail if isinstance(answer.result, NotLocalized) else None
