@@ -16,7 +16,7 @@ from topoloc import CalibrationError, Camera, RecordingError, StereoFrame, Unrea
 from topoloc.apps.cli.queries.query_answers import QueryFrame
 from topoloc.apps.formats.bags.bag_images import camera_info, decode_image, reduce_to_part
 from topoloc.apps.formats.bags.messages import frame_id, stamp_ns
-from topoloc.apps.formats.bags.pixel_order import _compare_orders as compare_orders
+from topoloc.apps.formats.bags.pixel_order import compare_orders
 from topoloc.apps.formats.bags.topics import is_rectified
 from topoloc.apps.robots.ros_node import RosNode
 

@@ -53,14 +53,14 @@ def _read_samples(bag: Bag, topic: Topic, refs: list[MessageRef]) -> Iterator[tu
         with suppress(RecordingError, UnreadableImageError):
             message = decode(topic, bag.read(ref))
             if hasattr(message, "encoding"):
-                evidence, encoding = _compare_orders(message), str(message.encoding)
+                evidence, encoding = compare_orders(message), str(message.encoding)
                 is_yuv = not encoding.endswith(("16", "C1"))
                 flag = f"is_bigendian {int(getattr(message, 'is_bigendian', 0))} of {encoding}"
                 if not np.isnan(evidence):
                     yield evidence, encoding if is_yuv else flag
 
 
-def _compare_orders(message: Any) -> float:
+def compare_orders(message: Any) -> float:
     """Return the evidence for the other order of bytes: sure above 1, NaN if the image does not
     decide."""
     pixels, to_rgb = decode_pixels(message, "")
