@@ -33,7 +33,7 @@ test test-slow: export PYTHONDONTWRITEBYTECODE =
 # The type checker keeps one processor busy: beside it, another compiles once what the tests' processes would each compile.
 test: $(VENV)/installed-test
 	@$(MAKE) --no-print-directory --jobs 2 lint kernels
-	@$(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+	@$(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal --durations 25
 
 kernels: $(VENV)/installed-test
 	@$(BIN)/python -c 'import topoloc; topoloc.warm_up()'

@@ -4,7 +4,6 @@ known noise, and the rendered room."""
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 import tiny_world
 from topoloc.features.extraction import FeatureConfig, extract_features
@@ -14,7 +13,6 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas
 from topoloc.points.motion_triangulation import (
     SourceImage,
-    compute_median_step,
     select_source_images,
     triangulate_from_motion,
 )
@@ -91,9 +89,20 @@ def test_mismatches_are_rejected():
     assert located.valid[wrong].mean() < 0.05
 
 
-def test_one_picture_or_none_or_no_motion_locates_nothing():
+def test_one_picture_suffices_with_the_sigma_that_it_has():
+    points, descriptors = _made()
+    one, all_of_them = (_located(points, descriptors, poses=poses) for poses in (POSES[:1], POSES))
+    assert one.valid.mean() > 0.9
+    errors = (one.points_cam - points)[one.valid]
+    squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(one.covariances[one.valid]), errors)
+    assert 2.0 < np.mean(squares) < 4.5  # three degrees of freedom
+    both = one.valid & all_of_them.valid
+    assert np.median(one.covariances[both, 2, 2] / all_of_them.covariances[both, 2, 2]) > 1.5
+
+
+def test_no_picture_or_no_motion_locates_nothing():
     points, descriptors = _made(50)
-    for poses in ([], POSES[:1], [Rigid3.identity()] * 3):
+    for poses in ([], [Rigid3.identity()] * 3):
         located = _located(points, descriptors, poses=poses)
         assert not located.valid.any()
         assert np.isnan(located.points_cam).all()
@@ -107,7 +116,7 @@ def test_points_of_the_rendered_room():
     )
     features = extract_features(left, FeatureConfig())
     pictures = []
-    for k in select_source_images(poses, 0, compute_median_step(poses)):
+    for k in select_source_images(poses, 0):
         found = extract_features(others[k - 1][0], FeatureConfig())
         pictures.append(
             SourceImage(
@@ -138,20 +147,19 @@ class TestChoice:
     LINE = tuple(Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(40))
 
     def test_distances_grow(self):
-        chosen = select_source_images(self.LINE, 5, compute_median_step(self.LINE))
-        assert sorted(abs(k - 5) for k in chosen) == [1, 2, 4, 7, 12, 20, 33, 34]
+        chosen = select_source_images(self.LINE, 5)
+        assert sorted(abs(k - 5) for k in chosen) == [1, 1, 2, 2, 4, 4, 7, 11, 17, 27]
+
+    def test_the_order_of_images_does_not_matter(self):
+        order = np.random.default_rng(1).permutation(40)
+        shuffled = [self.LINE[k] for k in order]
+        chosen = select_source_images(shuffled, order.tolist().index(5))
+        assert {int(order[k]) for k in chosen} == set(select_source_images(self.LINE, 5))
 
     def test_pictures_that_look_elsewhere_or_stand_in_one_place_do_not_count(self):
         turned = [
             Rigid3(exp_so3(np.array([0.0, 1.5 * (k % 2), 0.0])), pose.translation)
             for k, pose in enumerate(self.LINE)
         ]
-        assert all(k % 2 == 0 for k in select_source_images(turned, 4, 0.1))
-        standing = [Rigid3.identity()] * 5
-        assert compute_median_step(standing) == 0.0
-        assert select_source_images(standing, 0, 0.0) == []
-
-    def test_the_step_is_that_of_pictures_that_moved(self):
-        waited = [self.LINE[k] for k in (0, 0, 0, 1, 1, 2, 3)]
-        assert compute_median_step(waited) == pytest.approx(0.1)
-        assert compute_median_step([Rigid3.identity()]) == 0.0
+        assert all(k % 2 == 0 for k in select_source_images(turned, 4))
+        assert select_source_images([Rigid3.identity()] * 5, 0) == []

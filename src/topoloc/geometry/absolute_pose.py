@@ -180,7 +180,8 @@ def refine_absolute_pose(
         sigmas_px[rows],
         normalized[rows],
     )
-    found = matches.fit(start, camera, max_error_px, min_noise_scale=0.1)
+    # a second round changes nothing: the loss is robust, and the start is near
+    found = matches.fit(start, camera, max_error_px, num_rounds=1, min_noise_scale=0.1)
     return found and _pose_of_all(found, rows, len(points_img))
 
 

@@ -35,7 +35,6 @@ from topoloc.node_ids import NodeId
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.points.motion_triangulation import (
     SourceImage,
-    compute_median_step,
     select_source_images,
     triangulate_from_motion,
 )
@@ -193,10 +192,6 @@ class PointLocator:
         self._config = config
         sessions = groupby(frames, lambda frame: frame.session_id)
         self._sessions = {number: list(of_it) for number, of_it in sessions}
-        self._steps = {
-            number: compute_median_step([frame.world_from_cam for frame in of_it])
-            for number, of_it in self._sessions.items()
-        }
         self._image_cache: OrderedDict[int, MappingImage] = OrderedDict()
 
     def map_frames(
@@ -230,9 +225,9 @@ class PointLocator:
         them (`image_of`)."""
         others: list[MappingFrame] = []
         if not view.is_located:
-            frames, step = self._sessions[frame.session_id], self._steps[frame.session_id]
+            frames = self._sessions[frame.session_id]
             poses = [other.world_from_cam for other in frames]
-            others = [frames[k] for k in select_source_images(poses, frames.index(frame), step)]
+            others = [frames[k] for k in select_source_images(poses, frames.index(frame))]
         if view.is_located or view.depth is not None:
             of_kind = image.features.items()
             return {kind: locate_points(features, view) for kind, features in of_kind}, others

@@ -2,8 +2,9 @@
 structure from known motion.
 
 Each other image gives a depth for every matched feature, if the match lies on the epipolar line.
-Depths of a feature that agree are fused, weighted by their certainty. A single match may lie on its
-line by chance, so depths from several other images must agree.
+Depths of a feature that agree are fused, weighted by their certainty. If several other images show
+the feature, two must agree: a match may lie on its line by chance. One image suffices if no other
+shows the feature, as among few photos.
 """
 
 from __future__ import annotations
@@ -117,14 +118,13 @@ def _fuse_depths(
     gate: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return one inverse depth per feature with its standard deviation. It is fused from the
-    largest set of agreeing depths, or NaN if the set is too small.
+    largest set of agreeing depths, or NaN if no two of several agree.
 
     The uncertainty of the feature's own position (`own_sigma`) is common to all depths, so fusion
     does not reduce it.
     """
-    min_pictures = 2  # minimum number of other images whose depths of a point agree
-    num, columns = len(inverse), np.arange(inverse.shape[1])
-    if num < min_pictures:
+    columns = np.arange(inverse.shape[1])
+    if len(inverse) == 0:
         return np.full(len(columns), np.nan), np.full(len(columns), np.nan)
     spread = gate * np.sqrt(sigma[:, None] ** 2 + sigma[None] ** 2 + own_sigma**2)
     with np.errstate(invalid="ignore"):
@@ -134,39 +134,34 @@ def _fuse_depths(
     best = np.lexsort((np.nan_to_num(sigma, nan=np.inf), -support), axis=0)[0]
     chosen = agrees[best, :, columns].T
     weights = np.where(chosen, 1.0 / np.where(chosen, sigma, 1.0) ** 2, 0.0)
-    total, enough = weights.sum(axis=0), support[best, columns] >= min_pictures
+    total, num_found = weights.sum(axis=0), np.isfinite(inverse).sum(axis=0)
+    enough = support[best, columns] >= np.minimum(num_found, 2)
+    enough &= num_found > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         joined = (weights * np.where(chosen, inverse, 0.0)).sum(axis=0) / total
         sigma_joined = np.sqrt(1.0 / total + own_sigma**2)
     return np.where(enough, joined, np.nan), np.where(enough, sigma_joined, np.nan)
 
 
-def select_source_images(world_from_cams: Sequence[Rigid3], index: int, step: float) -> list[int]:
-    """Return the images that locate the features of image `index`: at several distances, with
-    similar viewing directions.
+def select_source_images(world_from_cams: Sequence[Rigid3], index: int) -> list[int]:
+    """Return the images that locate the features of image `index`, in any order of images.
 
-    Args:
-        step: typical distance between consecutive images, metres.
+    Near images that look the same way come first. Of images in about one direction and distance
+    only the first is taken, so that a dense video gives baselines of several lengths.
     """
-    max_turn = 0.6  # radians between the viewing directions; beyond it hardly any feature matches
-    # Distances of the other images, in units of the median distance of consecutive images.
-    steps = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
+    # Maximum number; radians between the viewing directions, beyond which hardly any feature
+    # matches; and the least distance of two sources, as a share of the distance to the image.
+    max_images, max_turn, min_apart = 12, 0.9, 0.35
     centres = positions_of(world_from_cams)
     axes = np.array([pose.rotation[:, 2] for pose in world_from_cams])
+    turns = np.arccos(np.clip(axes @ axes[index], -1.0, 1.0))
     distances = np.linalg.norm(centres - centres[index], axis=1)
-    usable = np.flatnonzero((axes @ axes[index] > np.cos(max_turn)) & (distances > 0.5 * step))
+    usable = np.flatnonzero((turns < max_turn) & (distances > 1e-6))
     chosen: list[int] = []
-    for factor in steps:
-        order = usable[np.argsort(np.abs(distances[usable] - factor * step), kind="stable")]
-        off = next((int(k) for k in order if k not in chosen), None)
-        if off is not None and abs(distances[off] - factor * step) <= 0.5 * factor * step:
-            chosen.append(off)
+    for k in usable[np.argsort((distances * (1.0 + 2.0 * turns))[usable], kind="stable")].tolist():
+        apart = np.linalg.norm(centres[chosen] - centres[k], axis=1)
+        if np.all(apart > min_apart * distances[k]):
+            chosen.append(k)
+        if len(chosen) == max_images:
+            break
     return chosen
-
-
-def compute_median_step(world_from_cams: Sequence[Rigid3]) -> float:
-    """Return the median distance (m) of consecutive images, without pairs taken at one place.
-    Return 0 if there is none."""
-    steps = np.linalg.norm(np.diff(positions_of(world_from_cams), axis=0), axis=1)
-    moved = steps[steps > 1e-6]
-    return float(np.median(moved)) if len(moved) else 0.0
