@@ -15,7 +15,8 @@ from pathlib import Path
 
 import topoloc
 from topoloc.apps.cli.queries.evaluate import read_rigid
-from topoloc.evaluation.certified_answers import CertifiedAnswers, find_pieces
+from topoloc.apps.quality.certificate_texts import describe_condition
+from topoloc.apps.quality.certified_answers import CertifiedAnswers, find_pieces
 
 
 def main() -> None:
@@ -37,13 +38,13 @@ def main() -> None:
         found = topoloc.certify(path, walks, others, map_from_truth)
         print(found.certificate.promise())
         for one in found.certificate.conditions:
-            print(f"  {one.name}: {one.describe()}")
+            print(f"  {one.name}: {describe_condition(one)}")
         level = found.certificate.applied_min_probability
         localizer = topoloc.Localizer(path)
         for name in args.unseen:
             sequence = topoloc.open_sequence(name)
             answers = topoloc.localize_queries(localizer, sequence, map_from_truth)
-            pieces = find_pieces(localizer.topomap.config, answers, by_pose=True)
+            pieces = find_pieces(localizer.topomap, answers, by_pose=True)
             facts = CertifiedAnswers(sequence.name, "walk", True, answers, pieces).facts(
                 level, 0.95
             )

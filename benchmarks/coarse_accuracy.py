@@ -32,8 +32,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence, to_grey
 from topoloc.recordings.open import open_sequence
 from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse_localizer
-from topoloc.retrieval.network_images import NetworkInputConfig
-from topoloc_training.classifier_config import CnnFcConfig
+from topoloc_training.classifier_config import CnnFcConfig, NetworkInputConfig
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
 COMPACT_PICTURE = NetworkInputConfig(112, 84)

@@ -18,15 +18,20 @@ import torch
 
 from topoloc.compiled import set_num_threads
 from topoloc.features.features import Features
-from topoloc.retrieval.backbones import Backbone
-from topoloc.retrieval.cnn_fc import CnnFc, NodeClassifier
-from topoloc.retrieval.cnn_nn import DEPTHS as CNN_DEPTHS, PooledFeatures
 from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel
-from topoloc.retrieval.inference import NetworkDescriptorLocalizer, has_bfloat16
-from topoloc.retrieval.network_images import BackboneName, NetworkInputConfig
-from topoloc.retrieval.vlad_nn import DEPTHS as VLAD_DEPTHS, VladNetwork
-from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig
-from topoloc_training.stored_weights import to_arrays
+from topoloc_training.backbones import Backbone
+from topoloc_training.classifier_config import (
+    BackboneName,
+    CnnNnConfig,
+    NetworkInputConfig,
+    VladNnConfig,
+)
+from topoloc_training.cnn_fc import CnnFc, NodeClassifier
+from topoloc_training.cnn_nn import DEPTHS as CNN_DEPTHS, PooledFeatures
+from topoloc_training.inference import has_bfloat16
+from topoloc_training.place_vectors import NetworkDescriptorLocalizer
+from topoloc_training.stored_networks import to_arrays
+from topoloc_training.vlad_nn import DEPTHS as VLAD_DEPTHS, VladNetwork
 
 NUM_NODES, NUM_IMAGES, DIMENSION = 100, 2000, 256
 NETWORKS: tuple[tuple[str, BackboneName], ...] = (

@@ -24,9 +24,8 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
-from topoloc.retrieval.network_images import NetworkInputConfig
 from topoloc_paper.posenet import PoseNet, PoseNetConfig, train_posenet
-from topoloc_training.classifier_config import TrainingConfig
+from topoloc_training.classifier_config import NetworkInputConfig, TrainingConfig
 from topoloc_training.weights import find_weights
 
 LOSSES = ("beta", "learnt", "reprojection")

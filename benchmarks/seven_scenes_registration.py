@@ -14,8 +14,8 @@ import sys
 import cv2
 import numpy as np
 
+from topoloc.apps.formats.seven_scenes import COLOUR_CAMERA, COLOUR_FROM_DEPTH, DEPTH_CAMERA
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.formats.seven_scenes import COLOUR_CAMERA, COLOUR_FROM_DEPTH, DEPTH_CAMERA
 from topoloc.recordings.frame import StereoFrame, to_grey
 from topoloc.recordings.open import open_sequence
 

@@ -16,8 +16,7 @@ from topoloc.demo.recordings import SHIPPED
 from topoloc.evaluation.metrics import summarize
 from topoloc.evaluation.query_localization import localize_queries
 from topoloc.mapping.nodes import NodeConfig
-from topoloc.retrieval.network_images import NetworkInputConfig
-from topoloc_training.classifier_config import CnnFcConfig, TrainingConfig
+from topoloc_training.classifier_config import CnnFcConfig, NetworkInputConfig, TrainingConfig
 from topoloc_training.coarse_storing import store_coarse
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 

@@ -17,7 +17,7 @@ OTHER_TESTS = {
 }
 # It draws triples of points. `find_least_median` compares their transforms.
 OTHER_ENGINES = {
-    "mapping/georeference_fit.py:_robust_weights",
+    "apps/georeferencing/georeference_fit.py:_robust_weights",
     "apps/cli/maps/floor.py:_sample_normal",  # it searches a plane, no transform
 }
 _ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)

@@ -59,7 +59,7 @@ def test_a_command_is_quiet(traced: Traced, name: str):
 
 
 def test_training_is_quiet(traced: Traced):
-    pytest.importorskip("torch", reason="torch is not installed (the extra deep)")
+    pytest.importorskip("torch", reason="torch is not installed")
     traced.run(*TRAIN, "--weights", "scratch")
     assert_quiet(traced)
 

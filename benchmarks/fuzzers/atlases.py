@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from topoloc.apps.georeferencing.georeference import georeference
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Manifest
 from topoloc.atlas.place import SharedWorld
@@ -18,7 +19,6 @@ from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import GeoPoint
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.georeference import georeference
 from topoloc.recordings.image_io import read_image
 
 from .damage import damage_bytes, damage_json

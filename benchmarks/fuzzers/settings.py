@@ -11,12 +11,12 @@ import numpy as np
 
 from topoloc.apps.cli.queries.evaluate import read_rigid
 from topoloc.apps.cli.settings_file import all_tables, read_settings, settings_text
+from topoloc.apps.formats.euroc import read_sensor
+from topoloc.apps.georeferencing.georeference import read_control_points, read_gnss
 from topoloc.apps.query_camera import parse_camera_option
 from topoloc.apps.service.query_request import parse_camera_field
-from topoloc.mapping.georeference import read_control_points, read_gnss
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.calibration import parse_calibration
-from topoloc.recordings.formats.euroc import read_sensor
 from topoloc.recordings.image_io import EncodedImage
 from topoloc.recordings.trajectory import Trajectory
 

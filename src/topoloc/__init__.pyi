@@ -4,6 +4,17 @@ from collections.abc import Callable
 from typing import Any
 
 from topoloc.apps.export.formats import export as export
+from topoloc.apps.georeferencing.georeference import (
+    GeoreferenceResult as GeoreferenceResult,
+    georeference as georeference,
+)
+from topoloc.apps.quality.certification import Certification as Certification, certify as certify
+from topoloc.apps.quality.weak_regions import (
+    NodeQuality as NodeQuality,
+    WeakRegion as WeakRegion,
+    WeakRegions as WeakRegions,
+    find_weak_regions as find_weak_regions,
+)
 from topoloc.apps.report.explanation import explain as explain
 from topoloc.apps.service.client import AsyncClient as AsyncClient, Client as Client
 from topoloc.apps.viewer.page import view as view
@@ -39,7 +50,6 @@ from topoloc.errors import (
     UnreadableImageError as UnreadableImageError,
     WeightsError as WeightsError,
 )
-from topoloc.evaluation.certification import Certification as Certification, certify as certify
 from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery, WorldFit as WorldFit
 from topoloc.evaluation.query_localization import (
     Evaluation as Evaluation,
@@ -66,12 +76,6 @@ from topoloc.lifelong.tiles.tile_joining import (
     join_tiles as join_tiles,
 )
 from topoloc.lifelong.update import MapUpdate as MapUpdate, update as update
-from topoloc.lifelong.weak_regions import (
-    NodeQuality as NodeQuality,
-    WeakRegion as WeakRegion,
-    WeakRegions as WeakRegions,
-    find_weak_regions as find_weak_regions,
-)
 from topoloc.localization.answer import Finding as Finding
 from topoloc.localization.config import LocalizerConfig as LocalizerConfig
 from topoloc.localization.image_calibration_check import (
@@ -90,10 +94,6 @@ from topoloc.localization.result import (
 from topoloc.localization.search import Trace as Trace, TriedProposal as TriedProposal
 from topoloc.mapping.build import BuildConfig as BuildConfig
 from topoloc.mapping.edit import read_history as read_history, undo_edit as undo_edit
-from topoloc.mapping.georeference import (
-    GeoreferenceResult as GeoreferenceResult,
-    georeference as georeference,
-)
 from topoloc.mapping.storage.entries import Illumination as Illumination, TopoNode as TopoNode
 from topoloc.mapping.topomap import TopoMetricMap as TopoMetricMap
 from topoloc.recordings.frame import (

@@ -1,5 +1,6 @@
 """Names for extensions, and the modules that define them."""
 
+from topoloc.apps.formats.video import Video as Video
 from topoloc.bounds import (
     Above as Above,
     AtLeast as AtLeast,
@@ -33,7 +34,6 @@ from topoloc.recordings.format import (
     read_ground_truth as read_ground_truth,
     times_from_rate as times_from_rate,
 )
-from topoloc.recordings.formats.video import Video as Video
 from topoloc.recordings.frame import IndexedFrames as IndexedFrames
 from topoloc.recordings.image_io import (
     EncodedImage as EncodedImage,

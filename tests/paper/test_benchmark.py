@@ -44,7 +44,7 @@ def room(tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.slow
 def test_the_paper_is_made_again_and_only_once(room: Path, capsys: pytest.CaptureFixture[str]):
-    pytest.importorskip("torch", reason="the extra `deep` is not installed")
+    pytest.importorskip("torch", reason="torch is not installed")
     assert main(["benchmark", "paper", "--quick", "--out", str(room)]) == 0
     printed = capsys.readouterr().out
     assert "0 done" not in printed

@@ -11,10 +11,14 @@ import torch
 from built_room import built_room, unseen_views
 from topoloc.errors import WeightsError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.retrieval.network_images import NetworkInputConfig, decode_stored_image
+from topoloc.recordings.stored_images import decode_stored_image
 from topoloc_paper.pose_losses import beta_loss, learnt_loss, reprojection_loss
 from topoloc_paper.posenet import PoseNet, PoseNetConfig, train_posenet
-from topoloc_training.classifier_config import AugmentationConfig, TrainingConfig
+from topoloc_training.classifier_config import (
+    AugmentationConfig,
+    NetworkInputConfig,
+    TrainingConfig,
+)
 
 
 def as_tensors(*world_from_cams: Rigid3) -> tuple[torch.Tensor, torch.Tensor]:

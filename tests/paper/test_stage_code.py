@@ -6,11 +6,12 @@ from __future__ import annotations
 import functools
 import shutil
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
-from topoloc.retrieval.coarse import _MODULES, COARSE_NAMES
+from topoloc.retrieval.coarse import COARSE_NAMES
 from topoloc_paper import stage_code
 from topoloc_paper.peers import _CODE
 from topoloc_paper.posenet_baseline import _CODE as POSENET
@@ -18,7 +19,6 @@ from topoloc_paper.stage_code import (
     COARSE_MODULES,
     MAPPING,
     ROOTS,
-    TEACHING_MODULES,
     StageCode,
     _file,
     answering,
@@ -26,7 +26,11 @@ from topoloc_paper.stage_code import (
     learning,
 )
 
-LEARNING = {f"learning {name}": learning(module) for name, module in TEACHING_MODULES.items()}
+LEARNING = {
+    f"learning {name}": learning(module)
+    for name, module in COARSE_MODULES.items()
+    if name != "surf-vlad"
+}
 STAGES: dict[str, StageCode] = {
     "mapping": MAPPING,
     "asking surf-vlad": asking("surf-vlad"),
@@ -94,8 +98,7 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc_paper/tables.py", set()),
         ("topoloc/errors.py", set()),
         ("topoloc/retrieval/vlad.py", {"mapping", *ASKING, *PEERS}),
-        ("topoloc/retrieval/cnn_nn.py", {"asking cnn-nn", "learning cnn-nn"}),
-        ("topoloc_training/cnn_nn.py", {"learning cnn-nn"}),
+        ("topoloc_training/cnn_nn.py", {"asking cnn-nn", "learning cnn-nn"}),
         ("topoloc_training/training.py", {"learning cnn-fc", "learning PoseNet"}),
         ("topoloc_training/coarse_training.py", {*LEARNING, "learning PoseNet"}),
         ("topoloc/mapping/landmarks.py", {"mapping"}),
@@ -148,11 +151,10 @@ def test_an_import_for_the_type_checker_alone_does_not_count(code: Path):
 
 
 def test_every_module_named_is_there():
-    assert {f"topoloc/retrieval/{module}.py" for module in _MODULES.values()} == set(
-        COARSE_MODULES.values()
-    )
+    points = entry_points(group="topoloc.coarse_localizers")
+    opened = {point.name: f"{point.module.replace('.', '/')}.py" for point in points}
+    assert opened | {"surf-vlad": "topoloc/retrieval/vlad.py"} == COARSE_MODULES
     assert COARSE_MODULES.keys() == set(COARSE_NAMES)
-    assert TEACHING_MODULES.keys() == set(COARSE_NAMES) - {"surf-vlad"}
     assert [
         name
         for name, stage in STAGES.items()

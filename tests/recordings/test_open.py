@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,6 +76,18 @@ def test_unknown_names(tmp_path: Path):
     (tmp_path / "a.mp3").write_bytes(b"la la la")
     with pytest.raises(UnknownFormatError, match=r"a\.mp3"):
         open_sequence(tmp_path / "a.mp3")
+
+
+def test_a_plain_folder_loads_no_other_format(tmp_path: Path):
+    write(tmp_path / "0.png", picture(0))
+    program = """if True:
+        import sys
+        from topoloc.recordings.open import open_sequence
+        assert len(open_sequence(sys.argv[1], format="folder")) == 1
+        print(*(name for name in sys.modules if "formats" in name))"""
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 @pytest.mark.parametrize("name", FORMATS)

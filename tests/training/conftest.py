@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from built_room import built_room
-from topoloc.retrieval.backbones import Backbone
+from topoloc_training.backbones import Backbone
 from topoloc_training.coarse_training import training_set_of
 from topoloc_training.training_set import TrainingSet
 

@@ -8,8 +8,8 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from topoloc.retrieval.backbones import normalize_images
 from topoloc_training.augmentation import augment
+from topoloc_training.backbones import normalize_images
 from topoloc_training.classifier_config import AugmentationConfig
 
 OFF = AugmentationConfig(**{item.name: 0.0 for item in fields(AugmentationConfig)})

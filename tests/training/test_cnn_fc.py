@@ -13,13 +13,17 @@ from test_place_vectors import NO_FEATURES, silent
 
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
-from topoloc.retrieval.backbones import Backbone
-from topoloc.retrieval.cnn_fc import CnnFc
+from topoloc.recordings.stored_images import decode_stored_image
 from topoloc.retrieval.coarse import CoarseModel, open_coarse_localizer
-from topoloc.retrieval.network_images import NetworkInputConfig, decode_stored_image
 from topoloc_training import cnn_fc, frozen_maps, training
-from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, TrainingConfig
-from topoloc_training.cnn_fc import calibrated_temperature, soft_labels
+from topoloc_training.backbones import Backbone
+from topoloc_training.classifier_config import (
+    AugmentationConfig,
+    CnnFcConfig,
+    NetworkInputConfig,
+    TrainingConfig,
+)
+from topoloc_training.cnn_fc import CnnFc, calibrated_temperature, soft_labels
 from topoloc_training.training_set import TrainingSet
 from topoloc_training.weights import Weights, read_weights
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from topoloc.errors import WeightsError
-from topoloc.retrieval.backbones import Backbone, SameConv, normalize_images
 from topoloc_training import efficientnet_weights
+from topoloc_training.backbones import Backbone, SameConv, normalize_images
 from topoloc_training.weights import find_weights, load_features, read_weights
 
 NAMES = {

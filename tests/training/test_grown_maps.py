@@ -16,13 +16,14 @@ from topoloc.apps.cli import main
 from topoloc.errors import TrainingError
 from topoloc.lifelong.session_content import update_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.stored_images import decode_stored_image
 from topoloc.retrieval.coarse import CoarseModel, open_coarse_localizer
-from topoloc.retrieval.network_images import NetworkInputConfig, decode_stored_image
 from topoloc_training import cnn_fc, cnn_nn
 from topoloc_training.classifier_config import (
     AugmentationConfig,
     CnnFcConfig,
     CnnNnConfig,
+    NetworkInputConfig,
     TrainingConfig,
 )
 from topoloc_training.coarse_training import (

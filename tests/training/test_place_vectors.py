@@ -14,14 +14,18 @@ from test_weights import netvlad_tensors
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
 from topoloc.features.features import Features
+from topoloc.recordings.stored_images import decode_stored_image
 from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel, open_coarse_localizer
-from topoloc.retrieval.inference import NetworkDescriptorLocalizer
-from topoloc.retrieval.network_images import NetworkInputConfig, decode_stored_image
-from topoloc.retrieval.vlad_nn import VladNetwork
 from topoloc_training import cnn_nn, vlad_nn
-from topoloc_training.classifier_config import CnnNnConfig, TripletConfig, VladNnConfig
+from topoloc_training.classifier_config import (
+    CnnNnConfig,
+    NetworkInputConfig,
+    TripletConfig,
+    VladNnConfig,
+)
+from topoloc_training.place_vectors import NetworkDescriptorLocalizer
 from topoloc_training.training_set import TrainingSet
-from topoloc_training.vlad_nn import tune
+from topoloc_training.vlad_nn import VladNetwork, tune
 from topoloc_training.weights import read_weights
 
 SMALL = NetworkInputConfig(112, 84)

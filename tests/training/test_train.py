@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import site
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,12 +15,13 @@ from pathlib import Path
 import pytest
 import torch
 
+import topoloc
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, create_atlas
 from topoloc.mapping.storage.map_reading import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.retrieval.backbones import Backbone
+from topoloc_training.backbones import Backbone
 
 SETTINGS = """
 [train]
@@ -159,6 +161,7 @@ def test_known_failures_are_one_line(
     )
 
 
+_PLAIN = "import sys; from topoloc.apps.cli import main; sys.exit(main(sys.argv[1:]))"
 _WITHOUT_TORCH = """
 import sys
 class Barred:
@@ -166,40 +169,58 @@ class Barred:
         if name == "torch":
             raise ModuleNotFoundError(name, name=name)
 sys.meta_path.insert(0, Barred())
-from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.editing import NewTile, create_atlas
 from topoloc.apps.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_without_torch_the_extra_is_named(
-    copied_map: Path, queries: Path, small: tuple[str, ...], weights_file: Path
+@pytest.fixture
+def without_training(tmp_path: Path) -> dict[str, str]:
+    """Return the environment of a Python that has all packages of this one but topoloc-training."""
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    for path in map(Path, site.getsitepackages()):
+        for entry in path.iterdir():
+            if not entry.name.startswith("topoloc_training"):
+                (packages / entry.name).symlink_to(entry)
+    source = Path(str(topoloc.__file__)).parents[1]
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(source), str(packages)])}
+
+
+@pytest.mark.parametrize("missing", ["torch", "topoloc-training"])
+def test_what_a_trained_localizer_lacks_is_named(
+    missing: str,
+    copied_map: Path,
+    queries: Path,
+    small: tuple[str, ...],
+    weights_file: Path,
+    without_training: dict[str, str],
 ):
-    assert (
-        main(
-            ["train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file), *small]
+    train = ("train", str(copied_map), "--coarse", "cnn-nn", "--weights", str(weights_file))
+    assert main([*train, "--default", *small]) == 0
+    how = {
+        "torch": ((), _WITHOUT_TORCH, os.environ),
+        "topoloc-training": (("-S",), _PLAIN, without_training),
+    }
+    options, code, environment = how[missing]
+
+    def topoloc_without(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *options, "-c", code, *words],
+            capture_output=True,
+            text=True,
+            env=dict(environment),
+            timeout=120,
+            check=False,
         )
-        == 0
-    )
-    command = [
-        sys.executable,
-        "-c",
-        _WITHOUT_TORCH,
-        "localize",
-        str(copied_map),
-        str(queries),
-        "--coarse",
-        "cnn-nn",
-    ]
-    answer = subprocess.run(
-        command, capture_output=True, text=True, env=dict(os.environ), timeout=120, check=False
-    )
-    assert (
-        answer.stderr
-        == "error: the coarse localizer 'cnn-nn' needs PyTorch: pip install 'topoloc[deep]'\n"
-    )
+
+    answer = topoloc_without("localize", str(copied_map), str(queries))
+    remedy = "pip install . ./training (in topoloc's source folder)"
+    assert answer.stderr == f"error: the coarse localizer 'cnn-nn' needs {missing}: {remedy}\n"
     assert answer.returncode == 1
+    own = topoloc_without("localize", str(copied_map), str(queries), "--coarse", "surf-vlad")
+    assert own.returncode == 0, own.stderr
+    assert " at " in own.stdout
 
 
 def test_mapping_and_queries_with_surf_vlad_load_no_torch(copied_map: Path, queries: Path):

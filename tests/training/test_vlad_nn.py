@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from topoloc.retrieval.vlad_nn import NetVlad
-from topoloc_training.vlad_nn import SECOND_SHARE, learn_words
+from topoloc_training.vlad_nn import SECOND_SHARE, NetVlad, learn_words
 
 
 def unit(array: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from topoloc.errors import WeightsError
-from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc_training import weights as weights_module
+from topoloc_training.backbones import Backbone, normalize_images
 from topoloc_training.weights import find_weights, load_features, read_weights
 
 

@@ -19,13 +19,12 @@ from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import write_bytes
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.network_images import NetworkInputConfig
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.settings import LEARNED, Bench, sequence_digest
-from topoloc_paper.stage_code import MAPPING, TEACHING_MODULES, learning
+from topoloc_paper.stage_code import COARSE_MODULES, MAPPING, learning
 from topoloc_paper.stages import Done, digest_of
 from topoloc_paper.stored_answers import pose_to_json
-from topoloc_training.classifier_config import CnnFcConfig
+from topoloc_training.classifier_config import CnnFcConfig, NetworkInputConfig
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
 Normalization = Literal["none", "paper", "wide"]
@@ -155,7 +154,7 @@ def taught(bench: Bench, dataset: Dataset, kind: MapKind, method: str) -> Done:
         f"coarse-{dataset.name}-{kind.name}-{method}",
         settings,
         train,
-        learning(TEACHING_MODULES[method]),
+        learning(COARSE_MODULES[method]),
         [target],
     )
 
@@ -207,7 +206,7 @@ def why_not(bench: Bench, method: str) -> str | None:
     try:
         import torch  # noqa: F401
     except ModuleNotFoundError:
-        return str(MissingExtraError("PyTorch is not installed: pip install 'topoloc[deep]'"))
+        return str(MissingExtraError("PyTorch is not installed: pip install . ./training"))
     return None
 
 

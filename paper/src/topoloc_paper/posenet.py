@@ -21,19 +21,19 @@ from topoloc.bounds import parse_settings
 from topoloc.errors import WeightsError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc.retrieval.coarse import Image
-from topoloc.retrieval.inference import BATCH_SIZE, to_channels_last
-from topoloc.retrieval.network_images import (
-    BackboneName,
-    ImageShape,
-    NetworkInputConfig,
-    prepare_network_images,
-)
 from topoloc_paper.pose_losses import beta_loss, learnt_loss, reprojection_loss
 from topoloc_training.augmentation import augment
-from topoloc_training.classifier_config import AugmentationConfig, TrainingConfig
+from topoloc_training.backbones import Backbone, normalize_images
+from topoloc_training.classifier_config import (
+    AugmentationConfig,
+    BackboneName,
+    NetworkInputConfig,
+    TrainingConfig,
+)
 from topoloc_training.coarse_training import training_set_of
+from topoloc_training.inference import BATCH_SIZE, to_channels_last
+from topoloc_training.network_images import ImageShape, prepare_network_images
 from topoloc_training.training import Task, Training, fit, hold_out
 from topoloc_training.training_set import Progress, decode_pictures
 from topoloc_training.weights import Weights, load_features

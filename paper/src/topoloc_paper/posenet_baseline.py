@@ -16,7 +16,6 @@ import numpy as np
 
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.retrieval.network_images import NetworkInputConfig
 from topoloc_paper.asking import queries_of
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, built, path_of
@@ -24,6 +23,7 @@ from topoloc_paper.settings import Bench, sequence_digest
 from topoloc_paper.stage_code import learning
 from topoloc_paper.stages import Done, digest_of
 from topoloc_paper.stored_answers import pose_of, pose_to_json
+from topoloc_training.classifier_config import NetworkInputConfig
 
 if TYPE_CHECKING:
     from topoloc_paper.posenet import PoseNet, PoseNetConfig

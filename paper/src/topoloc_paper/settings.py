@@ -8,11 +8,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from topoloc.recordings.frame import StereoSequence
-from topoloc.retrieval.network_images import BackboneName
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.stages import StageStore, digest_of
 from topoloc_paper.stored_answers import pose_to_json
-from topoloc_training.classifier_config import TrainingConfig
+from topoloc_training.classifier_config import BackboneName, TrainingConfig
 
 Progress = Callable[[str, int, int], None]
 LEARNED = ("cnn-fc", "cnn-nn", "vlad-nn")

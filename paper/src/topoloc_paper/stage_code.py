@@ -25,14 +25,9 @@ _FILES = {
 ROOTS = {name: Path(path).parents[1] for name, path in _FILES.items() if path is not None}
 COARSE_MODULES = {
     "surf-vlad": "topoloc/retrieval/vlad.py",
-    "cnn-fc": "topoloc/retrieval/cnn_fc.py",
-    "cnn-nn": "topoloc/retrieval/cnn_nn.py",
-    "vlad-nn": "topoloc/retrieval/vlad_nn.py",
-}
-TEACHING_MODULES = {
-    name: f"topoloc_training/{name.replace('-', '_')}.py"
-    for name in COARSE_MODULES
-    if name != "surf-vlad"
+    "cnn-fc": "topoloc_training/cnn_fc.py",
+    "cnn-nn": "topoloc_training/cnn_nn.py",
+    "vlad-nn": "topoloc_training/vlad_nn.py",
 }
 _READING = "topoloc/recordings/open.py"
 _COUNTING = (

@@ -13,7 +13,28 @@ from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
 from topoloc.features.feature_types import find_available_types as find_available_types
 from topoloc.features.network_files import NetworkInfo as NetworkInfo
 from topoloc.features.onnx_runtime import find_telemetry as find_telemetry
-from topoloc.localization.query import Deadline as Deadline
+from topoloc.geometry.alignment import nearest_rotation as nearest_rotation
+from topoloc.geometry.transform_consensus import find_least_median as find_least_median
+from topoloc.json_data import OneLine as OneLine, Positive as Positive
+from topoloc.lifelong.node_localization import (
+    LeaveOneOutResult as LeaveOneOutResult,
+    find_near_nodes as find_near_nodes,
+    localize_left_out as localize_left_out,
+    sample_evenly as sample_evenly,
+)
+from topoloc.localization.query import Deadline as Deadline, QueryImage as QueryImage
+from topoloc.mapping.certificate import (
+    Certificate as Certificate,
+    CertifiedCondition as CertifiedCondition,
+    CertifiedGroup as CertifiedGroup,
+    ConditionKind as ConditionKind,
+    GroupKind as GroupKind,
+    Quarter as Quarter,
+)
+from topoloc.mapping.edit import edit_map as edit_map
+from topoloc.mapping.nodes import NodePoses as NodePoses, node_distances as node_distances
+from topoloc.mapping.storage.entries import today as today
+from topoloc.node_ids import NodeId as NodeId, Row as Row
 from topoloc.recordings.atomic import (
     collect_written_paths as collect_written_paths,
     remove_stale_files as remove_stale_files,
@@ -21,20 +42,34 @@ from topoloc.recordings.atomic import (
 )
 from topoloc.recordings.calibration import (
     CalibrationForSize as CalibrationForSize,
+    find_calibration as find_calibration,
     first_image_size as first_image_size,
     parse_calibration as parse_calibration,
     replace_cameras as replace_cameras,
     with_calibration as with_calibration,
 )
-from topoloc.recordings.formats.video import silence_opencv as silence_opencv
+from topoloc.recordings.camera_files import (
+    kalibr_camera as kalibr_camera,
+    make_camera as make_camera,
+    make_rig as make_rig,
+    read_yaml as read_yaml,
+    require_numbers as require_numbers,
+    yaml_numbers as yaml_numbers,
+    yaml_word as yaml_word,
+)
+from topoloc.recordings.format import complete_lists as complete_lists, read_times as read_times
+from topoloc.recordings.frame import to_grey as to_grey
 from topoloc.recordings.image_files import find_path as find_path
 from topoloc.recordings.image_io import (
+    IMAGE_SUFFIXES as IMAGE_SUFFIXES,
     MAX_PIXELS as MAX_PIXELS,
     exif_focal_length as exif_focal_length,
     find_white_level as find_white_level,
 )
+from topoloc.recordings.named_poses import read_pose_matrix as read_pose_matrix
 from topoloc.recordings.open import find_format as find_format, split_selection as split_selection
 from topoloc.recordings.recording import (
+    RightImages as RightImages,
     as_monocular as as_monocular,
     has_scale as has_scale,
     keep_frames as keep_frames,
@@ -42,6 +77,15 @@ from topoloc.recordings.recording import (
 )
 from topoloc.recordings.ros_calibration import RosCalibration as RosCalibration
 from topoloc.recordings.stored_images import encode_jpeg as encode_jpeg
-from topoloc.recordings.trajectory import has_answers as has_answers
+from topoloc.recordings.text_files import (
+    parse_numbers as parse_numbers,
+    parse_times as parse_times,
+    read_file_list as read_file_list,
+    read_rows as read_rows,
+)
+from topoloc.recordings.trajectory import (
+    has_answers as has_answers,
+    timed_trajectory as timed_trajectory,
+)
 
 __all__: list[str]

@@ -49,14 +49,16 @@ from topoloc.mapping.topomap import Layer, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, select_certain_points
 from topoloc.recordings.frame_preparation import PreparedFrame
+from topoloc.recordings.stored_images import decode_stored_image
 from topoloc.retrieval.coarse import CoarseModel, ExtendableLocalizer, open_coarse_localizer
-from topoloc.retrieval.network_images import decode_stored_image
 from topoloc.retrieval.vlad import SurfVlad
 
 
 class MapPointLocator(PointLocator):
     """Locate the features of mapping frames in 3-D. What a single camera cannot triangulate in the
     images `learnt` (by index) is located by the landmarks of `topomap`."""
+
+    MIN_IMAGES = 2  # so that a session with wrong poses adds nothing
 
     def __init__(
         self, frames: Sequence[MappingFrame], topomap: TopoMetricMap, learnt: Collection[int]

@@ -42,7 +42,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import find_source_path
-from topoloc.retrieval.network_images import decode_stored_image
+from topoloc.recordings.stored_images import decode_stored_image
 from topoloc.slam.pose_graph import PoseGraphEdge, optimize_pose_graph
 
 _NUM_QUERIES, _MIN_LOCALIZED = 7, 3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, to_builtins
 
@@ -39,21 +39,6 @@ class CertifiedCondition(Struct, frozen=True, forbid_unknown_fields=True):
     answer_ms: NonNegative | None
     refusal_ms: NonNegative | None
 
-    def describe(self) -> str:
-        """Return the figures as text."""
-        text = f"{self.num_localized} of {self.num_images} images localized"
-        if self.max_wrong_share is not None:
-            text += (
-                f", {self.num_wrong} wrong; {self.num_wrong_pieces} of {self.num_pieces}"
-                f" independent ones wrong, at most {100 * self.max_wrong_share:.2g} %"
-            )
-        num_right = self.num_localized - self.num_wrong
-        if self.kind == "walk" and self.has_truth and num_right:
-            text += f"; {self.num_inside} of {num_right} right poses inside the 95 % ellipsoid"
-        times = [f"answer {self.answer_ms:.0f} ms"] if self.answer_ms is not None else []
-        times += [f"refusal {self.refusal_ms:.0f} ms"] if self.refusal_ms is not None else []
-        return "; ".join([text, ", ".join(times)]) if times else text
-
 
 class Quarter(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the figures of a quarter of the poses with a known truth, ordered by difficulty.
@@ -65,16 +50,6 @@ class Quarter(Struct, frozen=True, forbid_unknown_fields=True):
       inside the 95 % ellipsoid.
     """
 
-    COLUMNS: ClassVar = (
-        "quarter by",
-        "hardest to easiest",
-        "poses",
-        "right",
-        "mean p",
-        "inside 95 %",
-        "median sigma",
-    )
-
     by: Difficulty
     hardest: NonNegative
     easiest: NonNegative
@@ -84,20 +59,6 @@ class Quarter(Struct, frozen=True, forbid_unknown_fields=True):
     num_inside: Count
     median_position_sigma_m: NonNegative
     median_rotation_sigma_deg: NonNegative
-
-    def cells(self) -> tuple[str, ...]:
-        """Return the figures as text, in the order of the columns."""
-        digits, unit = {"inliers": (0, ""), "angle": (1, " deg"), "light": (2, "")}[self.by]
-        return (
-            self.by,
-            f"{self.hardest:.{digits}f} to {self.easiest:.{digits}f}{unit}",
-            str(self.num_poses),
-            f"{100 * self.num_right / self.num_poses:.1f} %",
-            f"{100 * self.mean_probability:.1f} %",
-            f"{100 * self.num_inside / self.num_poses:.1f} %",
-            f"{100 * self.median_position_sigma_m:.2f} cm,"
-            f" {self.median_rotation_sigma_deg:.2f} deg",
-        )
 
 
 class CertifiedGroup(Struct, frozen=True, forbid_unknown_fields=True):
@@ -114,29 +75,6 @@ class CertifiedGroup(Struct, frozen=True, forbid_unknown_fields=True):
     max_wrong_share: _Share | None
     min_probability: _Share | None
     threshold_wrong_share: _Share | None
-
-    def name(self) -> str:
-        """Return the group in words."""
-        unit = " deg" if self.by == "angle" else ""
-        if self.high is None:
-            return f"{self.by} {self.low:g}{unit} or more"
-        return f"{self.by} {self.low:g} to {self.high:g}{unit}"
-
-    def describe(self) -> str:
-        """Return the promise as text."""
-        share, at_threshold = self.max_wrong_share, self.threshold_wrong_share
-        if share is None:
-            return "no promise: the walks have no such image"
-        beside = "" if self.min_probability is not None else "; no threshold makes it less"
-        if at_threshold is not None and at_threshold < share:
-            share_text = f"{100 * at_threshold:.2g} %"
-            beside = (
-                f"; a threshold of {self.min_probability:.3g}, not applied, makes it {share_text}"
-            )
-        return (
-            f"at most {100 * share:.2g} % wrong (n = {self.num_pieces}); {self.num_localized} of"
-            f" {self.num_images} images localized, {self.num_wrong} wrong{beside}"
-        )
 
 
 class Certificate(Struct, frozen=True, forbid_unknown_fields=True):
@@ -213,18 +151,7 @@ class Certificate(Struct, frozen=True, forbid_unknown_fields=True):
         share = f"{100 * self.threshold_wrong_share:.2g} %"
         return f"{text}; with it at most {share} would be wrong, and {lost} refused"
 
-    def limits(self) -> str:
-        """Return what the promise does not cover."""
-        kinds = {one.kind for one in self.conditions if one.has_truth}
-        lacking = [text for kind, text in _LIMITS.items() if kind not in kinds]
-        return "; ".join([*lacking, "images unlike these are not covered"])
 
-
-_LIMITS: dict[ConditionKind, str] = {
-    "walk": "no walk with known poses: other light and changed things are not tested",
-    "surroundings_removed": "each image shows most of the map: places beside it are not tested",
-    "out_of_map": "no images of elsewhere (--out-of-map)",
-}
 _CONDITIONS: dict[ConditionKind, str] = {
     "walk": "walks through the place",
     "surroundings_removed": "places beside the map",

@@ -188,6 +188,9 @@ class PointLocator:
     """Locate the features of mapping frames in 3-D. The last images that may locate those of others
     are cached."""
 
+    MIN_IMAGES = 1
+    """Other images that must agree on a feature of a single camera."""
+
     def __init__(self, frames: Sequence[MappingFrame], config: MapConfig) -> None:
         self._config = config
         sessions = groupby(frames, lambda frame: frame.session_id)
@@ -243,7 +246,9 @@ class PointLocator:
                 for other in images
             ]
             sigmas = keypoint_sigmas(features)
-            points[kind] = triangulate_from_motion(features, sigmas, image.camera, source_images)
+            points[kind] = triangulate_from_motion(
+                features, sigmas, image.camera, source_images, min_images=self.MIN_IMAGES
+            )
         return points, others
 
     def image_of(self, frame: MappingFrame) -> MappingImage:

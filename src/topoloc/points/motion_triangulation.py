@@ -40,12 +40,15 @@ def triangulate_from_motion(
     camera: Camera,
     others: Sequence[SourceImage],
     pose_sigma_px: float = 0.5,
+    min_images: int = 1,
 ) -> MetricPoints:
     """Return the 3-D positions (camera frame, metres) of the features of an image taken by
     `camera`. `sigmas_px` are their standard deviations.
 
     Args:
         pose_sigma_px: standard deviation that pose errors add to that of a key point.
+        min_images: minimum number of other images whose depths of a feature agree. With 2, wrong
+            poses locate hardly any feature.
     """
     # Maximum distance of a match from its epipolar line, and of two depths from each other, in
     # standard deviations.
@@ -62,7 +65,7 @@ def triangulate_from_motion(
     )
     least = np.nan_to_num(per_sigma, nan=np.inf).min(axis=0, initial=np.inf)
     own = own_sigma * np.where(np.isfinite(least), least, 0.0)
-    joined, sigma_joined = _fuse_depths(inverse, sigma, own, gate)
+    joined, sigma_joined = _fuse_depths(inverse, sigma, own, gate, min_images)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1.0 / joined
         sigma_z = depth**2 * sigma_joined
@@ -116,6 +119,7 @@ def _fuse_depths(
     sigma: Float[np.ndarray, "k n"],
     own_sigma: Float[np.ndarray, " n"],
     gate: float,
+    min_images: int,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return one inverse depth per feature with its standard deviation. It is fused from the
     largest set of agreeing depths, or NaN if no two of several agree.
@@ -135,8 +139,7 @@ def _fuse_depths(
     chosen = agrees[best, :, columns].T
     weights = np.where(chosen, 1.0 / np.where(chosen, sigma, 1.0) ** 2, 0.0)
     total, num_found = weights.sum(axis=0), np.isfinite(inverse).sum(axis=0)
-    enough = support[best, columns] >= np.minimum(num_found, 2)
-    enough &= num_found > 0
+    enough = support[best, columns] >= np.clip(num_found, min_images, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         joined = (weights * np.where(chosen, inverse, 0.0)).sum(axis=0) / total
         sigma_joined = np.sqrt(1.0 / total + own_sigma**2)

@@ -1,8 +1,8 @@
 """Read calibrations and apply them to recordings.
 
-A calibration is a `camera.json`, YAML of OpenCV, Kalibr, ROS, VINS or ORB-SLAM, a file of
-`other_cameras.py`, or four numbers ``fx,fy,cx,cy`` in pixels. Four numbers and some files do not
-contain the image size. So a calibration is a function of the size of the images.
+A calibration is a `camera.json`, YAML of OpenCV, Kalibr or ROS, a file of another program
+(`READERS`), or four numbers ``fx,fy,cx,cy`` in pixels. Four numbers and some files do not contain
+the image size. So a calibration is a function of the size of the images.
 """
 
 from __future__ import annotations
@@ -27,13 +27,18 @@ from topoloc.recordings.camera_files import (
     read_camera_json,
     read_yaml,
 )
-from topoloc.recordings.formats.video import Video
+from topoloc.recordings.format import load_reader
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import image_size
-from topoloc.recordings.other_cameras import read_other_camera
 from topoloc.recordings.recording import Recording
-from topoloc.recordings.slam_settings import camera_files, read_slam_settings
 from topoloc.recordings.text_files import read_text
+
+# Readers of files of other programs ("module:function"), imported when one may be at hand.
+READERS = {
+    "slam_settings": "topoloc.apps.formats.calibrations.slam_settings:read_slam_settings",
+    "slam_files": "topoloc.apps.formats.calibrations.slam_settings:camera_files",
+    "other": "topoloc.apps.formats.calibrations.other_cameras:read_other_camera",
+}
 
 CalibrationForSize = Callable[[int, int], CameraCalibration]
 """Returns the calibration for images of this width and height (pixels). Raises CalibrationError."""
@@ -60,7 +65,7 @@ def parse_calibration(text: str | Path, allow_files: bool = True) -> Calibration
             " cameras.txt of it"
         )
     text = read_text(path, CalibrationError, "no such camera file")
-    if calibration := read_other_camera(path, text, camera_from_intrinsics):
+    if calibration := load_reader(READERS["other"])(path, text, camera_from_intrinsics):
         return calibration
     if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
         raise CalibrationError(
@@ -74,7 +79,7 @@ def parse_calibration(text: str | Path, allow_files: bool = True) -> Calibration
 def _read_yaml_calibration(path: Path, width: int, height: int) -> CameraCalibration:
     text = read_yaml(path)
     if has_slam_settings(text):
-        return read_slam_settings(path, text, (float(width), float(height)))
+        return load_reader(READERS["slam_settings"])(path, text, (float(width), float(height)))
     return read_calibration_yaml(path, width, height)
 
 
@@ -135,7 +140,8 @@ def find_calibration(folder: Path) -> CalibrationForSize | None:
         if path.suffix.lower() in YAML_SUFFIXES and path.is_file() and is_calibration(path)
     ]
     parts = {find_right_file(path) for path in found}
-    parts.update(file for path in found for file in camera_files(path, read_yaml(path)))
+    for path in found:
+        parts.update(load_reader(READERS["slam_files"])(path, read_yaml(path)))
     found = [path for path in found if path not in parts]
     if len(found) > 1:
         raise CalibrationError(
@@ -174,14 +180,6 @@ def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) 
             is not rectified.
         RecordingError: the calibration of this type of recording cannot be replaced.
     """
-    if isinstance(sequence, Video):
-        camera = calibration(*sequence.size).camera
-        if (camera.width, camera.height) != sequence.size:
-            raise CalibrationError(
-                f"{sequence.name}: of {sequence.size[0]}x{sequence.size[1]}, the camera of"
-                f" {camera.width}x{camera.height}"
-            )
-        return replace(sequence, camera=camera)
     if not isinstance(sequence, Recording):
         raise RecordingError(
             f"{sequence.name}: a recording of this kind keeps its own calibration; --camera does"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 from warnings import warn
 
 import numpy as np
@@ -15,6 +18,7 @@ from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import IMAGE_SUFFIXES
+from topoloc.recordings.named_poses import has_pose_matrices
 from topoloc.recordings.text_files import parse_times, read_rows
 from topoloc.recordings.trajectory import Trajectory, has_answers
 
@@ -34,6 +38,13 @@ class RecordingFormat:
     model. `calibration`: a calibration, if recordings of the format may lack one (otherwise
     `open_sequence` replaces the format's own). `calibration_file`: the path of a calibration,
     passed on as `calibration`."""
+
+
+@cache
+def load_reader(place: str) -> Any:
+    """Return what ``module:attribute`` names. The module is imported at the first use."""
+    module, _, attribute = place.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def list_images(folder: Path, suffix: str = "") -> list[Path]:
@@ -66,13 +77,15 @@ def natural_key(name: str) -> list[tuple[int, str]]:
     ]
 
 
-def complete_lists(num: int | None, *lists: list[Path]) -> list[list[Path]]:
+def complete_lists(times: Path | None, *lists: list[Path]) -> list[list[Path]]:
     """Return lists of images that correspond frame by frame, by the last number of each name.
-    Missing images are listed as well: partners, and gaps in the numbers if there are `num` frames.
+    Missing images are listed as well: partners, and gaps in the numbers if the file `times` has a
+    time for each.
 
     Raises:
-        RecordingError: less than half of the numbers are in all lists.
+        RecordingError: less than half of the numbers are in all lists, or `times` is empty.
     """
+    num = len(read_rows(times, RecordingError)) if times and times.is_file() else None
     series = [list(map(_number, paths)) for paths in lists]
     found = [dict(zip(*pair, strict=True)) for pair in zip(series, lists, strict=True)]
     is_unique = all(map(len, lists)) and list(map(len, found)) == list(map(len, lists))
@@ -168,11 +181,6 @@ def times_from_names(paths: Sequence[Path]) -> list[int] | None:
     return None
 
 
-def count_times(path: Path) -> int | None:
-    """Return the number of times in a file, or None if there is no file. Raises RecordingError."""
-    return len(read_rows(path, RecordingError)) if path.is_file() else None
-
-
 def read_times(path: Path, num_frames: int) -> list[int]:
     """Read times in nanoseconds from a file with one time in seconds per line. Without a file the
     rate is 10 Hz.
@@ -189,10 +197,12 @@ def read_times(path: Path, num_frames: int) -> list[int]:
     return t_ns
 
 
-def read_ground_truth(first: Path, others: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
-    """Return the pose of each frame from the first existing file: TUM by time, KITTI rows by frame.
-    Return None for all frames if no file exists. Answers of a map are no ground truth; a warning
-    names them.
+def read_ground_truth(
+    first: Path, others: list[Path], t_ns: list[int], names: Sequence[str] = ()
+) -> list[Rigid3 | None]:
+    """Return the pose of each frame from the first existing file: TUM by time, KITTI rows by frame,
+    rows with names, or a folder of matrices by the `names` of images. Return None for all frames if
+    no file exists. Answers of a map are no ground truth; a warning names them.
 
     Raises:
         TrajectoryError: the file is malformed, or matches no frame.
@@ -201,6 +211,6 @@ def read_ground_truth(first: Path, others: list[Path], t_ns: list[int]) -> list[
         if has_answers(path):
             text = f"{path}: answers of a map, no ground truth; delete its first line to use them"
             warn(text, stacklevel=2)
-        elif path.is_file():
-            return Trajectory.read(path).match_frames(t_ns, path)
+        elif path.is_file() or has_pose_matrices(path):
+            return Trajectory.read(path).match_frames(t_ns, path, names)
     return [None] * len(t_ns)

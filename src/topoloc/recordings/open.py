@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 from collections.abc import Callable, Mapping
-from functools import cache
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.depth_range import leave_out_stuck_depth
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.formats.video import Video
+from topoloc.recordings.format import RecordingFormat, load_reader
 from topoloc.recordings.frame import StereoSequence, sequence_subset
 from topoloc.recordings.image_files import find_path
 from topoloc.recordings.recording import leave_out_damaged, recording_notes
@@ -21,22 +18,22 @@ from topoloc.recordings.recording import leave_out_damaged, recording_notes
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
 # accepts any other folder with images. A format's module is imported when the format is tried.
 FORMATS = {
-    "euroc": "topoloc.recordings.formats.euroc:FORMAT",
-    "tum": "topoloc.recordings.formats.tum:FORMAT",
-    "seven_scenes": "topoloc.recordings.formats.seven_scenes:FORMAT",
-    "scannet": "topoloc.recordings.formats.scannet:FORMAT",
-    "arkitscenes": "topoloc.recordings.formats.arkitscenes:FORMAT",
+    "euroc": "topoloc.apps.formats.euroc:FORMAT",
+    "tum": "topoloc.apps.formats.tum:FORMAT",
+    "seven_scenes": "topoloc.apps.formats.seven_scenes:FORMAT",
+    "scannet": "topoloc.apps.formats.scannet:FORMAT",
+    "arkitscenes": "topoloc.apps.formats.arkitscenes:FORMAT",
     "nerfstudio": "topoloc.apps.formats.nerfstudio:FORMAT",
     "stray_scanner": "topoloc.apps.formats.stray_scanner:FORMAT",
     "record3d": "topoloc.apps.formats.record3d:FORMAT",
     "colmap": "topoloc.apps.formats.colmap:FORMAT",
     "colmap_database": "topoloc.apps.formats.colmap_database:FORMAT",
-    "kitti": "topoloc.recordings.formats.kitti:FORMAT",
+    "kitti": "topoloc.apps.formats.kitti:FORMAT",
     "rosbag": "topoloc.apps.formats.bags.bag_recording:ROSBAG_FORMAT",
     "mcap": "topoloc.apps.formats.bags.bag_recording:MCAP_FORMAT",
     "zed": "topoloc.apps.formats.zed:FORMAT",
-    "video": "topoloc.recordings.formats.video:FORMAT",
-    "folder": "topoloc.recordings.formats.folder:FORMAT",
+    "video": "topoloc.apps.formats.video:FORMAT",
+    "folder": "topoloc.recordings.folder:FORMAT",
 }
 
 
@@ -46,11 +43,9 @@ _BLOCK = re.compile(r"(\d{1,18})-(\d{1,18})/([1-9]\d{0,17})")
 _INDEX = re.compile(r"-?\d{1,18}")
 
 
-@cache
 def load_format(name: str) -> RecordingFormat:
     """Return the format with this name of `FORMATS`."""
-    module, _, attribute = FORMATS[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return load_reader(FORMATS[name])
 
 
 def open_sequence(
@@ -134,7 +129,7 @@ def find_format(
         raise RecordingError(f"{folder}: no such file or folder")
     if format is not None:
         return format
-    if str(camera).endswith(".conf") and Video.can_open(folder):
+    if str(camera).endswith(".conf") and load_format("video").can_open(folder):
         return "zed"
     if found := _recognise(folder):
         return found

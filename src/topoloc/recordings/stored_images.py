@@ -6,6 +6,8 @@ from __future__ import annotations
 import io
 
 import cv2
+import numpy as np
+from jaxtyping import UInt8
 from PIL import Image as PillowImage
 
 from topoloc.errors import MapError, UnreadableImageError
@@ -40,3 +42,9 @@ def read_stored_image(owner: str, data: bytes, max_size: tuple[int, int]) -> Ima
             fault = f"its image is {width}x{height}, more than {max_size[0]}x{max_size[1]}"
             raise MapError(f"{owner} is damaged: {fault}")
         return read_image(encoded)
+
+
+def decode_stored_image(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a stored mapping image in colour. Raises MapError if it is damaged or too large."""
+    image = read_stored_image("a mapping image of the map", jpeg, (4000, 4000))
+    return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
+from warnings import warn
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,6 +29,12 @@ from topoloc.geometry.pose_conventions import (
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.atomic import write_text
 from topoloc.recordings.frame import SequenceView, StereoSequence
+from topoloc.recordings.named_poses import (
+    match_names,
+    match_numbers,
+    poses_of_named_rows,
+    read_pose_folder,
+)
 from topoloc.recordings.recording import scale_poses, with_poses
 from topoloc.recordings.text_files import (
     NANOSECONDS_PER_SECOND,
@@ -38,7 +45,6 @@ from topoloc.recordings.text_files import (
     parse_uniform_times,
     read_numeric_table,
     read_rows,
-    read_text,
 )
 
 # tolerance for times written with few decimals
@@ -52,10 +58,11 @@ _ANSWERS_HEADER = "# answers of a topoloc map, no ground truth"
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Hold poses in order of time. `t_ns` are their times, strictly increasing, or None if poses
-    belong to frames by row."""
+    belong to frames by row, or by name: `by_name` holds None for a pose that is lost."""
 
     world_from_cam: Sequence[Rigid3]
     t_ns: list[int] | None = None
+    by_name: dict[str, Rigid3 | None] | None = None
 
     def __repr__(self) -> str:
         return f"Trajectory({len(self)} poses)"
@@ -80,13 +87,15 @@ class Trajectory:
 
     @staticmethod
     def read(path: Path) -> Trajectory:
-        """Read a TUM file (8 columns) or KITTI rows (12 columns). TUM times are in seconds, or in
-        nanoseconds if they are large.
+        """Read a TUM file (8 columns), KITTI rows (12 columns), poses by name, or a folder of
+        matrices (`named_poses.py`). TUM times are in seconds, or in nanoseconds if they are large.
 
         Raises:
             TrajectoryError: the file is missing or empty, the number of columns is wrong, a number
                 is NaN, a rotation is invalid, or times do not increase. Names the line.
         """
+        if path.is_dir():
+            return _named_trajectory(read_pose_folder(path))
         return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
 
     def interpolate(self, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:
@@ -103,18 +112,29 @@ class Trajectory:
         gap_ns, poses = round(max_gap * NANOSECONDS_PER_SECOND), self.world_from_cam
         return [_interpolate_pose(self.t_ns, poses, time, gap_ns) for time in t_ns]
 
-    def match_frames(self, t_ns: Sequence[int], path: Path) -> list[Rigid3 | None]:
-        """Return the pose of each frame by time, or by row if the trajectory has no times.
+    def match_frames(
+        self, t_ns: Sequence[int], path: Path, names: Sequence[str] = ()
+    ) -> list[Rigid3 | None]:
+        """Return the pose of each frame by time, or by row or name if the trajectory has no times.
+        Times that are the numbers of the frames (`names`) count as such; a warning says so.
 
         Raises:
             TrajectoryError: the numbers of rows and frames differ, or no frame has a pose. Names
                 `path` and a likely difference of the clocks.
         """
+        if self.by_name is not None:
+            return match_names(self.by_name, names, path)
         if self.t_ns is None:
             if len(self) != len(t_ns):
                 raise TrajectoryError(f"{path}: {len(self)} poses for {len(t_ns)} frames")
             return list(self.world_from_cam)
         poses = self.interpolate(t_ns)
+        if 2 * sum(pose is not None for pose in poses) < len(poses):
+            by_number = match_numbers(self.world_from_cam, self.t_ns, names)
+            if by_number is not None:
+                text = "its times are the numbers of the pictures, and taken as such"
+                warn(f"{path}: {text}", stacklevel=2)
+                return by_number
         if t_ns and all(pose is None for pose in poses):
             span = f"{self.t_ns[0] / 1e9:.3f} to {self.t_ns[-1] / 1e9:.3f} s"
             frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
@@ -139,18 +159,6 @@ class Trajectory:
         write_text(path, f"{_ANSWERS_HEADER}\n" * are_answers + self.to_tum())
 
 
-def read_pose_matrix(path: Path) -> Rigid3 | None:
-    """Read the 4x4 matrix of one pose (metres). None if it is lost, with infinite numbers. Raises
-    TrajectoryError: the file holds other numbers, or no pose."""
-    try:
-        numbers = np.array(read_text(path, TrajectoryError).split(), dtype=np.float64)
-        matrix = numbers.reshape(4, 4)
-    except ValueError:
-        raise TrajectoryError(f"{path}: not a matrix of 4x4 numbers") from None
-    with TrajectoryError.at(path):
-        return None if np.isinf(matrix).any() else Rigid3.from_matrix(matrix)
-
-
 def has_answers(path: Path) -> bool:
     """Return whether the poses of a trajectory file are answers of a map."""
     with suppress(OSError), path.open("rb") as file:
@@ -173,10 +181,13 @@ def _read_numeric_trajectory(path: Path) -> Trajectory | None:
 
 def _trajectory_from_rows(path: Path) -> Trajectory:
     rows = read_rows(path, TrajectoryError)
+    if (named := poses_of_named_rows(path, rows)) is not None:
+        return _named_trajectory(named)
     num_columns = len(rows[0][1])
     if num_columns not in (8, 12):
         raise TrajectoryError(
-            f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12"
+            f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12,"
+            " and one more if they begin with the name of the picture instead of a time"
         )
     for line, tokens in rows:
         if len(tokens) != num_columns:
@@ -189,6 +200,10 @@ def _trajectory_from_rows(path: Path) -> Trajectory:
     poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
     check_rows(is_rotation, "not a rotation", path, rows)
     return Trajectory(poses)
+
+
+def _named_trajectory(by_name: dict[str, Rigid3 | None]) -> Trajectory:
+    return Trajectory([pose for pose in by_name.values() if pose is not None], by_name=by_name)
 
 
 def timed_trajectory(path: Path, rows: Rows, columns: Sequence[int]) -> Trajectory:
@@ -209,7 +224,8 @@ def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
 def with_trajectory(
     sequence: StereoSequence, path: Path, conventions: PoseConventions | None = None
 ) -> StereoSequence:
-    """Return the recording with the poses of a trajectory file: TUM by time, KITTI rows by frame.
+    """Return the recording with the poses of a trajectory file: TUM by time, KITTI rows by frame,
+    rows with names and folders of matrices by name.
 
     For a selection of frames, KITTI rows may belong to the selection or to the whole recording.
 
@@ -218,14 +234,15 @@ def with_trajectory(
     """
     trajectory, conventions = Trajectory.read(path), conventions or PoseConventions()
     if (
-        trajectory.t_ns is None
+        trajectory.t_ns is trajectory.by_name is None
         and isinstance(sequence, SequenceView)
         and len(trajectory) == len(sequence.base) != len(sequence)
     ):
         rows = trajectory.match_frames(sequence.base.t_ns, path)
         poses = [rows[index] for index in sequence.indices]
     else:
-        poses = _to_frame_clock(trajectory, conventions).match_frames(sequence.t_ns, path)
+        on_clock = _to_frame_clock(trajectory, conventions)
+        poses = on_clock.match_frames(sequence.t_ns, path, sequence.names)
     return with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
@@ -251,7 +268,7 @@ def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
     Raises:
         TrajectoryError: the file is malformed, fits no frame, or its positions fix no scale.
     """
-    theirs = Trajectory.read(path).match_frames(sequence.t_ns, path)
+    theirs = Trajectory.read(path).match_frames(sequence.t_ns, path, sequence.names)
     pairs = zip(sequence.poses, theirs, strict=True)
     both = [(a, b) for a, b in pairs if a is not None and b is not None]
     if not both:

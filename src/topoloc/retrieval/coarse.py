@@ -1,7 +1,9 @@
 """Define coarse localization: the selection of the map nodes that an image may show.
 
 All coarse localizers implement `CoarseLocalizer.rank`. Their trained state is a `CoarseModel`,
-which the map file stores. Names are the paper's. `surf-vlad` needs neither weights nor torch.
+which the map file stores. Names are the paper's. `surf-vlad` needs neither weights nor torch. Other
+distributions add localizers with entry points of the group `topoloc.coarse_localizers`, which are
+named as the models: topoloc-training those with trained networks.
 """
 
 from __future__ import annotations
@@ -9,19 +11,19 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol, get_args, runtime_checkable
+from importlib import metadata
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from topoloc.bounds import AtLeast, Between, parse_value
+from topoloc.bounds import AtLeast, Between
 from topoloc.errors import ConfigError, MapError, MissingExtraError
 from topoloc.features.features import Features
 from topoloc.node_ids import Row
 
-CoarseName = Literal["surf-vlad", "cnn-fc", "cnn-nn", "vlad-nn"]
-COARSE_NAMES: tuple[CoarseName, ...] = get_args(CoarseName)
-_MODULES = {"surf-vlad": "vlad", "cnn-fc": "cnn_fc", "cnn-nn": "cnn_nn", "vlad-nn": "vlad_nn"}
+COARSE_NAMES = ("surf-vlad", "cnn-fc", "cnn-nn", "vlad-nn")
+_INSTALL = "pip install . ./training (in topoloc's source folder)"
 
 Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
@@ -137,29 +139,32 @@ def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
 
     Raises:
         MapError: the model is damaged, or this version does not support it.
-        MissingExtraError: the model needs torch, which is not installed.
+        MissingExtraError: the model needs topoloc-training or PyTorch, which is not installed.
     """
     if model.name in _extensions:
         return _extensions[model.name](model)
-    if model.name not in COARSE_NAMES:
-        raise MapError(
-            f"the map's coarse localizer {model.name!r} is not known to this version (known:"
-            f" {', '.join(COARSE_NAMES)}; others after topoloc.plugin.register_coarse_localizer)"
-        )
+    open_model = _load_opener(model.name)
     try:
-        module = importlib.import_module(f"topoloc.retrieval.{_MODULES[model.name]}")
-        return module.open_model(model)
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingExtraError(
-            f"the coarse localizer {model.name!r} needs PyTorch: pip install 'topoloc[deep]'"
-        ) from error
+        return open_model(model)
     except ConfigError as error:
         raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {error}") from error
 
 
-def read_setting(model: CoarseModel, name: str, of: Any) -> Any:
-    """Return a setting of a stored model, converted to the type `of`. Unknown keys are ignored.
-    Raises ConfigError."""
-    return parse_value(of, model.settings.get(name), name, is_strict=False)
+def _load_opener(name: str) -> Opener:
+    """Load what opens models of this name, of topoloc or of another distribution."""
+    if name == "surf-vlad":
+        return importlib.import_module("topoloc.retrieval.vlad").open_model
+    is_trained = name in COARSE_NAMES
+    missing = "topoloc-training" if is_trained else None
+    for entry_point in metadata.entry_points(group="topoloc.coarse_localizers", name=name):
+        try:
+            return entry_point.load()
+        except ImportError as error:
+            missing = error.name or str(error)
+    if missing is not None:
+        remedy = _INSTALL if is_trained else "install it"
+        raise MissingExtraError(f"the coarse localizer {name!r} needs {missing}: {remedy}")
+    raise MapError(
+        f"the map's coarse localizer {name!r} is not known to this version (known:"
+        f" {', '.join(COARSE_NAMES)}; others after topoloc.plugin.register_coarse_localizer)"
+    )

@@ -18,8 +18,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.stored_images import encode_jpeg
-from topoloc.retrieval.network_images import decode_stored_image
+from topoloc.recordings.stored_images import decode_stored_image, encode_jpeg
 
 
 @pytest.fixture(scope="module")

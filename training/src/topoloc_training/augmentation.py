@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Generator, Tensor, nn
 
-from topoloc.retrieval.backbones import normalize_images
+from topoloc_training.backbones import normalize_images
 from topoloc_training.classifier_config import AugmentationConfig
 
 

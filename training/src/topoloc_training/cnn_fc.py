@@ -1,28 +1,123 @@
-"""cnn-fc is taught: each mapping image is labelled with its nearest node by Eq. 1 (position and
-heading), or with those about as near."""
+"""Rank nodes with a classification network that has one output per node, trained on the mapping
+images: cnn-fc.
+
+This is the paper's first classifier (section III-A): VGG-11 with its last layer replaced, or a
+smaller backbone. Each image is labelled with its nearest node by Eq. 1 (position and heading), or
+with those about as near. Scores are probabilities, calibrated on images held out of the training.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 from torch import Generator, Tensor, nn
 
-from topoloc.errors import TrainingError
-from topoloc.retrieval.cnn_fc import NAME, NodeClassifier
-from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.inference import BATCH_SIZE, to_channels_last
-from topoloc.retrieval.network_images import BackboneName, ImageShape, prepare_network_images
-from topoloc_training.classifier_config import CnnFcConfig
+from topoloc.errors import MapError, TrainingError
+from topoloc.features.features import Features
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import Row
+from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array
+from topoloc_training.backbones import Backbone, has_wide_classifier
+from topoloc_training.classifier_config import BackboneName, ClassifierNetworkConfig, CnnFcConfig
 from topoloc_training.frozen_maps import FrozenMaps, plain_maps
-from topoloc_training.stored_weights import rounded_to_half, to_arrays
+from topoloc_training.inference import BATCH_SIZE, Predictor, to_channels_last
+from topoloc_training.network_images import ImageShape, prepare_network_images
+from topoloc_training.stored_networks import (
+    load_network_weights,
+    read_setting,
+    rounded_to_half,
+    to_arrays,
+)
 from topoloc_training.training import Task, Training, deterministic, fit, hold_out
 from topoloc_training.training_set import Progress, TrainingSet, decode_pictures
-from topoloc_training.weights import Weights, describe
+from topoloc_training.weights import MAP, Weights, describe
+
+NAME = "cnn-fc"
+MAX_OUTPUTS = 100_000
+_SQUEEZED, _ROWS, _COLUMNS = 64, 4, 5
+_OUTPUT_LAYERS = ("head.5.", "backbone.classifier.6.")
+
+
+class NodeClassifier(nn.Module):
+    """Map images to one score per node.
+
+    VGG keeps its classifier except for the last layer. The small networks end with a mean over the
+    image, which discards positions. Their features are reduced and pooled in cells instead.
+    """
+
+    def __init__(self, backbone: BackboneName, num_nodes: int) -> None:
+        super().__init__()
+        wide = has_wide_classifier(backbone)
+        self.backbone = Backbone(backbone, num_outputs=num_nodes if wide else None)
+        num_channels = self.backbone.num_channels
+        self.head = nn.Identity() if wide else _grid_pooling_head(num_channels, num_nodes)
+
+    def forward(self, images: Tensor, first: int = 0) -> Tensor:
+        """Return one score per node. Arguments are those of `Backbone.forward`."""
+        return self.head(self.backbone(images, first))
+
+
+class CnnFc:
+    """Implement the coarse localizer `cnn-fc`.
+
+    Raises:
+        MapError: the model's arrays are inconsistent.
+    """
+
+    def __init__(self, model: CoarseModel) -> None:
+        self._input_config = read_setting(model, "config", ClassifierNetworkConfig).picture
+        self._shape = ImageShape(*read_setting(model, "picture_shape", tuple[int, int]))
+        self._temperature = read_setting(model, "temperature", float)
+        num_outputs = read_setting(model, "num_nodes", int)
+        damaged = f"the map's coarse localizer {NAME!r} is damaged:"
+        if not 0 < num_outputs <= MAX_OUTPUTS or self._temperature <= 0.0:
+            raise MapError(f"{damaged} {num_outputs} outputs, temperature {self._temperature}")
+        try:
+            network = NodeClassifier(read_setting(model, "backbone", BackboneName), num_outputs)
+            self._predict = Predictor(load_network_weights(network, model.arrays))
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise MapError(f"{damaged} {' '.join(str(error).split())[:200]}") from error
+        # row in the map of each output's node, -1 for removed nodes
+        self._rows = (
+            model_array(model, "node_ids", "iu", (num_outputs,))
+            if "node_ids" in model.arrays
+            else np.arange(num_outputs)
+        )
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        """Rank nodes as in `CoarseLocalizer.rank`. Scores are probabilities. The local features are
+        not used."""
+        return self.rank_batch([image], num_candidates)[0]
+
+    def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
+        """Rank nodes for many images, which pass through the network together."""
+        ranked = []
+        for row in self.probabilities(images):
+            outputs = np.argsort(-row, kind="stable")
+            outputs = outputs[self._rows[outputs] >= 0][:num_candidates]
+            ranked.append([NodeScore(Row(int(self._rows[k])), float(row[k])) for k in outputs])
+        return ranked
+
+    def probabilities(self, images: Sequence[Image]) -> Float32[np.ndarray, "n nodes"]:
+        """Return the probability of each output's node for each image."""
+        rgb_images = prepare_network_images(images, self._shape, self._input_config)
+        outputs = self._predict(rgb_images) / np.float32(self._temperature)
+        powers = np.exp(outputs - outputs.max(axis=1, keepdims=True))
+        return powers / powers.sum(axis=1, keepdims=True)
+
+
+def _grid_pooling_head(num_channels: int, num_nodes: int) -> nn.Sequential:
+    squeeze = nn.Conv2d(num_channels, _SQUEEZED, 1), nn.ReLU(True)
+    pool = nn.AdaptiveAvgPool2d((_ROWS, _COLUMNS)), nn.Flatten()
+    linear = nn.Linear(_SQUEEZED * _ROWS * _COLUMNS, num_nodes)
+    return nn.Sequential(*squeeze, *pool, nn.Dropout(0.3), linear)
 
 
 def train(
@@ -197,3 +292,66 @@ def _for_tuning(config: CnnFcConfig) -> CnnFcConfig:
         num_copies=min(config.num_copies, num_epochs),
         training=replace(config.training, max_epochs=num_epochs),
     )
+
+
+def weights_of_map(topomap: TopoMetricMap, backbone: BackboneName) -> Weights:
+    """Return the network of the map's cnn-fc with an output for each node of the map.
+
+    A new node starts with the output of the known node nearest by Eq. 1, whose images are most
+    similar.
+
+    Raises:
+        TrainingError: the map has no cnn-fc, or one with another backbone, or one without any
+            node of the map.
+        MapError: the cnn-fc is damaged.
+    """
+    model = topomap.first_layer.coarse_models.get(NAME)
+    if model is None:
+        raise TrainingError(
+            f"the map has no {NAME} to begin with; train one without --weights {MAP}"
+        )
+    CnnFc(model)  # a damaged one is named
+    if (its := model.settings["backbone"]) != backbone:
+        raise TrainingError(
+            f"the map's {NAME} stands on {its}, not on {backbone}; give --backbone {its}"
+        )
+    outputs = _output_of_each_node(
+        topomap, np.asarray(model.arrays.get("node_ids", np.arange(model.settings["num_nodes"])))
+    )
+    tensors = {}
+    for name, array in model.arrays.items():
+        if name.startswith("network."):
+            name = name.removeprefix("network.")
+            values = torch.from_numpy(np.asarray(array, np.float32))
+            tensors[name.removeprefix("backbone.")] = (
+                values[torch.from_numpy(outputs)] if name.startswith(_OUTPUT_LAYERS) else values
+            )
+    origin = model.settings.get("weights") or {"file": "", "sha256": ""}
+    return Weights(
+        backbone,
+        tensors,
+        origin["file"],
+        origin["sha256"],
+        num_outputs=int(model.settings["num_nodes"]),
+    )
+
+
+def _output_of_each_node(
+    topomap: TopoMetricMap, node_ids: Int[np.ndarray, " outputs"]
+) -> Int[np.ndarray, " nodes"]:
+    output_of = {int(node_id): output for output, node_id in enumerate(node_ids)}
+    known = [row for row, summary in enumerate(topomap.summaries) if summary.node_id in output_of]
+    if not known:
+        raise TrainingError(
+            f"the map's {NAME} knows none of its nodes; train one without --weights {MAP}"
+        )
+    poses = NodePoses.from_poses([topomap.summaries[row].world_from_cam for row in known])
+    outputs = []
+    for summary in topomap.summaries:
+        nearest = known[
+            int(node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot).argmin())
+        ]
+        outputs.append(
+            output_of.get(summary.node_id, output_of[topomap.summaries[nearest].node_id])
+        )
+    return np.array(outputs, np.int64)

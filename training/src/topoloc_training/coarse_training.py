@@ -15,8 +15,7 @@ from topoloc.errors import EmptyMapError, TrainingError
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.network_images import BackboneName
-from topoloc_training.classifier_config import CnnFcConfig, CnnNnConfig, VladNnConfig
+from topoloc_training.classifier_config import BackboneName, CnnFcConfig, CnnNnConfig, VladNnConfig
 from topoloc_training.training_set import Progress, TrainingSet
 
 
@@ -55,8 +54,7 @@ def train_coarse(
         raise TrainingError(
             "surf-vlad learns from the recording's local features: `topoloc build` makes it"
         )
-    from topoloc_training.weights import find_weights  # PyTorch takes its time
-    from topoloc_training.widening import MAP, weights_of_map
+    from topoloc_training.weights import MAP, find_weights  # PyTorch takes its time
 
     if weights == MAP and name != "cnn-fc":
         raise TrainingError(
@@ -67,7 +65,11 @@ def train_coarse(
     config = config or CoarseTrainingConfig()
     check_bounds(config)
     of_name = {"cnn-fc": config.cnn_fc, "cnn-nn": config.cnn_nn, "vlad-nn": config.vlad_nn}[name]
-    found = weights_of_map(topomap, backbone) if weights == MAP else find_weights(backbone, weights)
+    found = (
+        module.weights_of_map(topomap, backbone)
+        if weights == MAP
+        else find_weights(backbone, weights)
+    )
     arguments = (
         training_set_of(topomap),
         backbone,

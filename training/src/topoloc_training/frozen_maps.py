@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Int
 from torch import Generator, Tensor, nn
 
-from topoloc.retrieval.backbones import normalize_images
-from topoloc.retrieval.inference import BATCH_SIZE
 from topoloc_training.augmentation import augment
+from topoloc_training.backbones import normalize_images
 from topoloc_training.classifier_config import CnnFcConfig
+from topoloc_training.inference import BATCH_SIZE
 from topoloc_training.training_set import Progress
 
 MAX_BYTES = 1_000_000_000

@@ -17,7 +17,7 @@ from topoloc.atlas.place import open_place
 from topoloc.mapping.storage.map_reading import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.network_images import BackboneName
+from topoloc_training.classifier_config import BackboneName
 from topoloc_training.coarse_storing import store_coarse
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 

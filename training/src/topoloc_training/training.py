@@ -23,8 +23,8 @@ from torch import Generator, Tensor, nn
 
 from topoloc.errors import TrainingError
 from topoloc.recordings.atomic import atomic_write
-from topoloc.retrieval.inference import has_bfloat16, threads
 from topoloc_training.classifier_config import TrainingConfig
+from topoloc_training.inference import has_bfloat16, threads
 from topoloc_training.training_set import Progress
 
 BatchLoss = Callable[[Tensor, Generator], Tensor]

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.retrieval.network_images import ImageShape, RgbImage, decode_stored_image
+from topoloc.recordings.stored_images import decode_stored_image
+from topoloc_training.network_images import ImageShape, RgbImage
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""

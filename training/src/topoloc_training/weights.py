@@ -25,12 +25,14 @@ from torch import Tensor
 from topoloc.errors import WeightsError
 from topoloc.features.network_files import cache_folder
 from topoloc.recordings.atomic import atomic_write
-from topoloc.retrieval.backbones import NUM_CHANNELS, Backbone
-from topoloc.retrieval.network_images import BackboneName
+from topoloc_training.backbones import NUM_CHANNELS, Backbone
+from topoloc_training.classifier_config import BackboneName
 from topoloc_training.efficientnet_weights import installed_file, is_efficientnet, named_as_backbone
 
 SCRATCH = "scratch"
 """In place of a file: start from random weights."""
+MAP = "map"
+"""In place of a file: start from the weights of the map's own cnn-fc."""
 
 # Published by torchvision (BSD-3); a file's name ends with the first eight hexadecimal digits of
 # its SHA-256.

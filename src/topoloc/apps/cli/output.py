@@ -21,6 +21,7 @@ from topoloc import MissingExtraError, TopolocError
 from topoloc.apps import core_names
 from topoloc.apps.cli import discard_output, printable
 from topoloc.apps.core_names import remove_stale_files
+from topoloc.apps.quality.certificate_texts import QUARTER_COLUMNS, quarter_cells
 from topoloc.apps.report.plotting import load_matplotlib
 from topoloc.plugin import write_text
 
@@ -274,7 +275,7 @@ def print_quarters(quarters: Sequence[Any]) -> None:
     """Print `Evaluation.quarters` or those of a certificate as a table below other facts."""
     if quarters:
         print()
-        print_table([quarters[0].COLUMNS, *(one.cells() for one in quarters)])
+        print_table([QUARTER_COLUMNS, *map(quarter_cells, quarters)])
 
 
 def _row(recording: dict[str, Any]) -> tuple[str, ...]:

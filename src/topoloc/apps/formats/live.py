@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 
 from topoloc import Image, RecordingError
-from topoloc.apps.core_names import silence_opencv
+from topoloc.apps.formats.video import silence_opencv
 
 _URL = re.compile(r"(rtsps?|rtmp|https?|udp|tcp)://\S+", re.IGNORECASE)
 _DEVICE = re.compile(r"\d{1,3}|/dev/video\d{1,3}")

@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Callable
 from functools import cache
+from itertools import product
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
@@ -214,10 +215,13 @@ def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> D
 
 
 def _with_suffix(folder: Path, name: str) -> str:
-    """Add the suffix of the file, which Blender's scenes omit."""
-    for suffix in _SUFFIXES:
-        if os.path.exists(find_path(folder / f"{name}{suffix}")):
-            return f"{name}{suffix}"
+    """Add the suffix of the file, which Blender's scenes omit. If the path begins in another
+    folder, its longest end that exists counts."""
+    parts = PurePath(name).parts
+    for start, suffix in product(range(len(parts)), _SUFFIXES):
+        end = PurePath(*parts[start:]).as_posix()
+        if os.path.exists(find_path(folder / f"{end}{suffix}")):
+            return f"{end}{suffix}"
     return name if PurePath(name).suffix else f"{name}.png"
 
 

@@ -6,6 +6,7 @@ from html import escape
 from pathlib import Path
 
 from topoloc import Certification, TopoMetricMap
+from topoloc.apps.quality.certificate_texts import describe_group, describe_limits
 from topoloc.apps.report.map_figure import draw_map
 from topoloc.apps.report.page_template import (
     render_cards,
@@ -42,14 +43,14 @@ def write_certificate(path: Path, found: Certification, topomap: TopoMetricMap, 
     one = found.certificate
     lead = f'<p class="lead">{escape(one.promise()[:1].upper() + one.promise()[1:])}.</p>'
     limits = f"<p>Threshold: {escape(one.describe_threshold())}.</p>"
-    limits += f"<p>Limits: {escape(one.limits())}.</p>"
+    limits += f"<p>Limits: {escape(describe_limits(one))}.</p>"
     sections = [
         _render_cards(found),
         render_section("The promise", "", lead + limits),
         render_section("What was measured", _FIGURES, _render_conditions(found)),
     ]
     if one.groups:
-        rows = [(escape(group.name()), escape(group.describe())) for group in one.groups]
+        rows = [tuple(map(escape, describe_group(group))) for group in one.groups]
         table = render_table(("group", "promise"), rows, "tried", "Groups")
         sections.append(render_section("Promises for groups", _GROUPS, table))
     sections.append(render_quarters(one.quarters))

@@ -9,6 +9,7 @@ from typing import Any
 
 from topoloc import EvaluatedQuery
 from topoloc.apps.core_names import format_length
+from topoloc.apps.quality.certificate_texts import QUARTER_COLUMNS, quarter_cells
 from topoloc.apps.report.page_template import (
     recording_colours,
     render_cards,
@@ -144,8 +145,8 @@ def render_quarters(quarters: Sequence[Any]) -> str:
     """Return `Evaluation.quarters`, or those of a certificate, as a section; nothing if empty."""
     if not quarters:
         return ""
-    rows = [[escape(cell) for cell in one.cells()] for one in quarters]
-    table = render_table(quarters[0].COLUMNS, rows, "tried", "Quarters of difficulty")
+    rows = [[escape(cell) for cell in quarter_cells(one)] for one in quarters]
+    table = render_table(QUARTER_COLUMNS, rows, "tried", "Quarters of difficulty")
     return render_section("Where it is hard", _QUARTERS, table)
 
 

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.apps.formats.kitti import open_kitti
 from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
-from topoloc.recordings.formats.folder import open_folder
-from topoloc.recordings.formats.kitti import open_kitti
+from topoloc.recordings.folder import open_folder
 from topoloc.recordings.frame import StereoFrame, to_grey
 
 _NEAREST = 3  # day's pictures for one of the others

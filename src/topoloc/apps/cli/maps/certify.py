@@ -38,6 +38,11 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.apps.cli.queries.evaluate import read_rigid
 from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.quality.certificate_texts import (
+    describe_condition,
+    describe_group,
+    describe_limits,
+)
 from topoloc.apps.report.plotting import load_matplotlib
 
 Recordings = Annotated[
@@ -138,13 +143,13 @@ def _import_page_writer() -> Callable[..., None]:
 
 def _print(found: Certification) -> None:
     certificate = found.certificate
-    rows = [(one.name, one.describe()) for one in certificate.conditions]
+    rows = [(one.name, describe_condition(one)) for one in certificate.conditions]
     facts = [("promise", certificate.promise()), *rows]
-    facts += [(one.name(), one.describe()) for one in certificate.groups]
+    facts += map(describe_group, certificate.groups)
     facts.append(("threshold", certificate.describe_threshold()))
     if spots := found.blind_spots:
         where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*p.translation) for p in spots[:5])
         facts.append(("blind spots", f"{len(spots)}, at {where}{' ...' if len(spots) > 5 else ''}"))
-    facts.append(("limits", certificate.limits()))
+    facts.append(("limits", describe_limits(certificate)))
     print_fields(facts)
     print_quarters(certificate.quarters)

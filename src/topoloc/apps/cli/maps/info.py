@@ -36,6 +36,7 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 from topoloc.apps.export.formats import coordinates, geojson_feature
+from topoloc.apps.quality.certificate_texts import describe_group
 from topoloc.plugin import write_bytes
 
 MAX_PROBLEMS = 20
@@ -114,7 +115,7 @@ def _print(info: dict[str, Any], topomap: TopoMetricMap) -> None:
             ("floors", f"{floors} (topoloc update --look-alike-floors changes it)"),
             ("certificate", _describe_certificate(info["certificate"])),
             *([("threshold", certificate.describe_threshold())] if certificate else []),
-            *((one.name(), one.describe()) for one in (certificate.groups if certificate else ())),
+            *map(describe_group, certificate.groups if certificate else ()),
             *([("check", info["check"])] if "check" in info else []),
         ]
     )
