@@ -3,12 +3,9 @@ a damaged map cannot fill the memory."""
 
 from __future__ import annotations
 
-import io
-
 import cv2
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image as PillowImage
 
 from topoloc.errors import MapError, UnreadableImageError
 from topoloc.recordings.frame import Image
@@ -17,16 +14,17 @@ from topoloc.recordings.image_io import EncodedImage, image_size, read_image
 
 def encode_jpeg(image: Image, quality: int) -> bytes:
     """Encode an image as JPEG. The same image gives the same bytes."""
-    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
 def encode_webp(image: Image, quality: int) -> bytes:
-    """Encode an image as WebP. The same image gives the same bytes. Method 2 takes half the time of
-    OpenCV's and 4 % more bytes."""
-    stream = io.BytesIO()
-    PillowImage.fromarray(image).save(stream, "WEBP", quality=quality, method=2)
-    return stream.getvalue()
+    """Encode an image as WebP. The same image gives the same bytes."""
+    return _encode(image, ".webp", [cv2.IMWRITE_WEBP_QUALITY, quality])
+
+
+def _encode(image: Image, suffix: str, options: list[int]) -> bytes:
+    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(suffix, bgr, options)[1].tobytes()
 
 
 def read_stored_image(owner: str, data: bytes, max_size: tuple[int, int]) -> Image:
