@@ -41,8 +41,8 @@ def _row(pose: Rigid3 | None) -> np.ndarray:
     return np.concatenate([pose.translation, np.roll(pose.quat_wxyz(), -1)])
 
 
-def _write_tum(photos: StereoSequence, path: Path, k: int) -> str:
-    return " ".join([f"{path}", *map(str, _row(photos.poses[k]))])
+def _named_row(photos: StereoSequence, name: str, k: int) -> str:
+    return " ".join([name, *map(str, _row(photos.poses[k]))])
 
 
 def _localized_cm(path: Path, every: int = 4) -> list[float]:
@@ -61,7 +61,7 @@ def _localized_cm(path: Path, every: int = 4) -> list[float]:
 def test_photos_in_any_order_of_files_with_poses_by_name(tmp_path: Path):
     order = np.random.default_rng(5).permutation(100)
     photos = _photos(tmp_path / "photos", lambda k: f"images/IMG_{order[k]:04}.png")
-    rows = [_write_tum(photos, Path(f"IMG_{order[k]:04}.png"), k) for k in range(len(photos))]
+    rows = [_named_row(photos, f"IMG_{order[k]:04}.png", k) for k in range(len(photos))]
     (tmp_path / "poses.txt").write_text("\n".join(rows))
     words = [str(tmp_path / "photos"), str(tmp_path / "lab.topo")]
     assert main(["build", *words, "--trajectory", str(tmp_path / "poses.txt")]) == 0
@@ -98,6 +98,13 @@ def test_rows_that_may_be_read_in_two_ways_are_refused(tmp_path: Path):
     path = tmp_path / "poses.txt"
     path.write_text("a.jpg 1 0 0 0 0 0 1\nb.jpg 0 1 0 0 0 0 1\n")
     with pytest.raises(TrajectoryError, match="may both be the quaternion; write"):
+        Trajectory.read(path)
+
+
+def test_a_name_with_two_poses_is_refused(tmp_path: Path):
+    path = tmp_path / "poses.txt"
+    path.write_text("a.jpg 1 2 3 0 0 0 1\na.jpg 4 5 6 0 0 0 1\n")
+    with pytest.raises(TrajectoryError, match=r"'a\.jpg' has several poses"):
         Trajectory.read(path)
 
 

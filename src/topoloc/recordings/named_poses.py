@@ -7,13 +7,16 @@ holds one matrix per image.
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.pose_conventions import pose_from_quaternion
+from topoloc.geometry.pose_conventions import pose_from_quaternion, poses_from_matrices
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.text_files import (
     NANOSECONDS_PER_SECOND,
@@ -23,7 +26,7 @@ from topoloc.recordings.text_files import (
     read_text,
 )
 
-_ROTATION_TOLERANCE = 1e-2
+ROTATION_TOLERANCE = 1e-2
 
 
 def read_pose_matrix(path: Path) -> Rigid3 | None:
@@ -60,14 +63,15 @@ def poses_of_named_rows(path: Path, rows: Rows) -> dict[str, Rigid3 | None] | No
     num = len(rows[0][1]) - 1
     if _is_number(names[0]) or num not in (7, 12) or any(len(row) != num + 1 for _, row in rows):
         return None
+    repeated = next((name for name, count in Counter(names).items() if count > 1), None)
+    if repeated is not None:
+        raise TrajectoryError(f"{path}: {repeated!r} has several poses; leave one")
     numbers = parse_numbers(path, rows, range(1, num + 1))
     if num == 12:
-        matrices = np.concatenate([numbers, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))], axis=1)
-        with TrajectoryError.at(path):
-            return dict(
-                zip(names, map(Rigid3.from_matrix, matrices.reshape(-1, 4, 4)), strict=True)
-            )
-    is_last, is_first = _are_unit(numbers[:, 3:]), _are_unit(numbers[:, :4])
+        poses, is_rotation = poses_from_matrices(numbers, ROTATION_TOLERANCE)
+        check_rows(is_rotation, "not a rotation", path, rows)
+        return dict(zip(names, poses, strict=True))
+    is_last, is_first = is_unit_quaternion(numbers[:, 3:]), is_unit_quaternion(numbers[:, :4])
     if is_last.all() and is_first.all():
         raise TrajectoryError(
             f"{path}: the first four numbers and the last four may both be the quaternion; write"
@@ -111,8 +115,8 @@ def match_numbers(
     if len(names) < 3 or any(stamp % NANOSECONDS_PER_SECOND for stamp in t_ns):
         return None
     of_number = dict(zip((stamp // NANOSECONDS_PER_SECOND for stamp in t_ns), poses, strict=True))
-    digits = ["".join(filter(str.isdigit, PurePosixPath(name).stem)) for name in names]
-    numbers = [int(digit) if digit else -1 for digit in digits]
+    found = [re.findall(r"\d+", PurePosixPath(name).stem) for name in names]
+    numbers = [int(digits[-1]) if digits else -1 for digits in found]
     if len(set(numbers)) == len(numbers) and of_number.keys() <= set(numbers):
         return [of_number.get(number) for number in numbers]
     is_counted = t_ns[-1] - t_ns[0] == (len(t_ns) - 1) * NANOSECONDS_PER_SECOND
@@ -127,5 +131,8 @@ def _is_number(token: str) -> bool:
     return True
 
 
-def _are_unit(quaternions: np.ndarray) -> np.ndarray:
-    return np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= _ROTATION_TOLERANCE
+def is_unit_quaternion(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+    """Return which quaternions have length 1 up to rounding."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions))
+        return np.abs(lengths - 1.0) <= ROTATION_TOLERANCE

@@ -16,7 +16,7 @@ from pathlib import Path
 from warnings import warn
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import align_scaled_poses
@@ -30,6 +30,8 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.atomic import write_text
 from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.recordings.named_poses import (
+    ROTATION_TOLERANCE,
+    is_unit_quaternion,
     match_names,
     match_numbers,
     poses_of_named_rows,
@@ -49,7 +51,6 @@ from topoloc.recordings.text_files import (
 
 # tolerance for times written with few decimals
 _TIME_TOLERANCE_NS = 1_000_000
-_ROTATION_TOLERANCE = 1e-2
 _MIN_OVERLAP_SHARE = 0.8  # minimum overlap of two clocks, as a share of the frames' duration
 TUM_HEADER = "# t tx ty tz qx qy qz qw (s, m; world_from_cam)"
 _ANSWERS_HEADER = "# answers of a topoloc map, no ground truth"
@@ -171,10 +172,10 @@ def _read_numeric_trajectory(path: Path) -> Trajectory | None:
     line by line."""
     numbers, lines = read_numeric_table(path, TrajectoryError) or (np.zeros((0, 0)), [])
     if numbers.shape[1] == 12:
-        poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
+        poses, is_rotation = poses_from_matrices(numbers, ROTATION_TOLERANCE)
         return Trajectory(poses) if is_rotation.all() else None
     t_ns, rows = parse_uniform_times(lines) if numbers.shape[1] == 8 else None, numbers[:, 1:]
-    if t_ns is None or not _is_unit_quaternion(rows[:, 3:]).all():
+    if t_ns is None or not is_unit_quaternion(rows[:, 3:]).all():
         return None
     return Trajectory.from_quaternions(rows, t_ns)
 
@@ -197,7 +198,7 @@ def _trajectory_from_rows(path: Path) -> Trajectory:
     if num_columns == 8:
         return timed_trajectory(path, rows, range(1, 8))
     numbers = parse_numbers(path, rows, range(12))
-    poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
+    poses, is_rotation = poses_from_matrices(numbers, ROTATION_TOLERANCE)
     check_rows(is_rotation, "not a rotation", path, rows)
     return Trajectory(poses)
 
@@ -210,7 +211,7 @@ def timed_trajectory(path: Path, rows: Rows, columns: Sequence[int]) -> Trajecto
     """Read rows of a time and the given columns: x, y, z (metres) and a quaternion (x, y, z, w).
     Raises TrajectoryError."""
     t_ns, numbers = parse_times(rows, path, TrajectoryError), parse_numbers(path, rows, columns)
-    check_rows(_is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
+    check_rows(is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
     return Trajectory.from_quaternions(numbers, t_ns)
 
 
@@ -313,10 +314,3 @@ def _interpolate_pose(
     rows = [row for row in (after - 1, after) if 0 <= row < len(times)]
     near = [row for row in rows if abs(times[row] - time) <= _TIME_TOLERANCE_NS]
     return poses[min(near, key=lambda row: abs(times[row] - time))] if near else None
-
-
-def _is_unit_quaternion(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
-    """Return which quaternions have length 1 up to rounding."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        lengths = np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions))
-        return np.abs(lengths - 1.0) <= _ROTATION_TOLERANCE

@@ -1,8 +1,8 @@
-"""Tell a camera that stands in front of a still world from one that hangs, by equal images.
+"""Distinguish a camera that stands still from one that hangs, by equal images.
 
-Images of a real camera differ by noise. Equal ones come from a simulator without noise, where they
-show that the camera stands, or from a driver that sends an old image again. Odometry decides: equal
-images while it moves are old. While it stands, they are old if the camera is known to have noise.
+Images of a real camera differ by noise. Equal images have two causes. A simulator without noise
+gives them while the camera stands. A driver that hangs sends an old image again. Odometry decides:
+equal images are old if it moves, or if the camera is known to have noise.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _REMEDY = (
 
 @dataclass(frozen=True)
 class Repeat:
-    """Hold what an image says that equals the one before.
+    """Hold the verdict on an image that equals its predecessor.
 
     Attributes:
-        number: count of the equal images before it.
-        fault: why it is no evidence, in one sentence. Empty: it shows that the camera stands.
+        number: count of equal images before it.
+        fault: reason why it is no evidence, one sentence. Empty: the camera stands.
         seconds: time without evidence.
     """
 
@@ -37,7 +37,7 @@ class Repeat:
 
 
 class RepeatedImages:
-    """Hold the last image and `odom_from_cam`, the odometry at the first of those that equal it.
+    """Hold the last image, and the odometry `odom_from_cam` at its first occurrence.
 
     Args:
         is_simulated: the camera has no noise, so equal images show that it stands.
@@ -77,8 +77,8 @@ class RepeatedImages:
     def learn_noise(
         self, t_ns: int, odom_from_cam: Rigid3 | None, world_from_cam: Rigid3 | None
     ) -> None:
-        """Take the pose of the last image. Images that differ for long while pose and odometry
-        stand still are those of a camera with noise."""
+        """Take the pose of the last image. The camera has noise if images differ for long while
+        pose and odometry stand still."""
         max_motion, max_change = 0.001, 0.03  # metres and radians; of odometry and of poses
         now = None
         if odom_from_cam is not None and world_from_cam is not None:
@@ -137,9 +137,9 @@ class RepeatedImages:
 
 
 def _differs_everywhere(before: UInt8[np.ndarray, "..."], image: UInt8[np.ndarray, "..."]) -> bool:
-    """Return whether pixels changed in nearly all parts of an image, as by noise. What moves in
-    front of a camera changes some."""
-    num, least = 4, 12  # parts along a side; of them all
+    """Return whether pixels changed in nearly all parts of an image, as by noise. A moving object
+    changes only some parts."""
+    num, least = 4, 12  # parts along a side; least number of changed parts
     if before.shape != image.shape:
         return False
     rows, columns = (size // num * num for size in image.shape[:2])
