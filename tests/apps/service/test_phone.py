@@ -134,6 +134,7 @@ def test_the_map_lies_over_the_image_where_truth_puts_it(phone: Phone, size: tup
             shown = page.evaluate(DRAWN)
             if shown and shown["image"] not in images:
                 images.add(shown["image"])
+                assert "Here to" in page.inner_text("[data-part=seen]")
                 errors = _errors(phone, shown)
                 assert len(errors) > 300
                 assert np.quantile(errors, 0.99) < 3.0
@@ -141,6 +142,7 @@ def test_the_map_lies_over_the_image_where_truth_puts_it(phone: Phone, size: tup
                 break
             page.wait_for_timeout(100)
         assert len(images) >= 3, "the camera's images change"
+        page.wait_for_timeout(1500)  # longer than a camera shows an image, which is asked once
         assert "Here to" in page.inner_text("[data-part=seen]")
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
         assert page.evaluate(UNNAMED) == []

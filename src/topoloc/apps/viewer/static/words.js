@@ -7,7 +7,7 @@ const REASONS = {
   ambiguous: "Several similar places are possible.",
   not_in_map: "The image is probably out of the map.",
   jump: "It contradicts the previous images.",
-  unreadable: "The image cannot be read.",
+  unreadable: "The image cannot be used.",
 };
 const STATES = {
   localized: "localized in the map",

@@ -36,7 +36,8 @@ export class Live {
       await shown();
       try {
         run.link ??= await this.opened(run);
-        const picture = this.webcam.picture();
+        const picture = await this.webcam.next();
+        if (this.run !== run) return;
         this.told.took(picture);
         const answer = await run.link.ask(picture);
         faults = 0;

@@ -4,6 +4,7 @@ import { product } from "topoloc/page/projection";
 
 const MAX_SIDE = 640;
 const JPEG_QUALITY = 0.85;
+const MAX_WAIT_MS = 5000; // for the next image of a camera
 const REFUSALS = {
   NotFoundError: "This device has no camera.",
   NotReadableError: "Another program uses the camera. Close it, and try again.",
@@ -28,6 +29,7 @@ export class Webcam {
       const wanted = { facingMode: "environment", width: { ideal: 1280 } };
       this.video.srcObject = await navigator.mediaDevices.getUserMedia({ video: wanted });
       await this.video.play();
+      this.shown = null;
     } catch (error) {
       this.close();
       throw new Error(REFUSALS[error.name] ?? `The camera does not start: ${error.message}`);
@@ -48,6 +50,15 @@ export class Webcam {
     this.video.play().catch(() => {}); // iOS stops it with the page
     this.lock = await navigator.wakeLock?.request("screen").catch(() => null);
     if (!this.isOn) this.lock?.release();
+  }
+
+  /** The next picture that was not taken before, as `picture` returns it. A service takes equal pictures for those of a camera that hangs. */
+  async next() {
+    const late = new Promise((resolve) => setTimeout(resolve, MAX_WAIT_MS, "late"));
+    if ((await Promise.race([this.shown, late])) === "late") throw new Error("The camera gives no images.");
+    const picture = this.picture();
+    this.shown = new Promise((resolve) => this.video.requestVideoFrameCallback?.(resolve) ?? resolve());
+    return picture;
   }
 
   /** What the camera sees now: {canvas, file, time}, the time in ms since 1970. */
