@@ -5,6 +5,7 @@ import { product } from "topoloc/page/projection";
 const MAX_SIDE = 640;
 const JPEG_QUALITY = 0.85;
 const MAX_WAIT_MS = 5000; // for the next image of a camera
+const POLL_MS = 30;
 const REFUSALS = {
   NotFoundError: "This device has no camera.",
   NotReadableError: "Another program uses the camera. Close it, and try again.",
@@ -29,7 +30,7 @@ export class Webcam {
       const wanted = { facingMode: "environment", width: { ideal: 1280 } };
       this.video.srcObject = await navigator.mediaDevices.getUserMedia({ video: wanted });
       await this.video.play();
-      this.shown = null;
+      this.last = null;
     } catch (error) {
       this.close();
       throw new Error(REFUSALS[error.name] ?? `The camera does not start: ${error.message}`);
@@ -52,16 +53,20 @@ export class Webcam {
     if (!this.isOn) this.lock?.release();
   }
 
-  /** The next picture that was not taken before, as `picture` returns it. A service takes equal pictures for those of a camera that hangs. */
+  /** The next picture that differs from the last one. A service takes equal pictures for those of a camera that hangs. */
   async next() {
-    const late = new Promise((resolve) => setTimeout(resolve, MAX_WAIT_MS, "late"));
-    if ((await Promise.race([this.shown, late])) === "late") throw new Error("The camera gives no images.");
-    const picture = this.picture();
-    this.shown = new Promise((resolve) => this.video.requestVideoFrameCallback?.(resolve) ?? resolve());
+    const end = performance.now() + MAX_WAIT_MS;
+    let picture = this.picture();
+    while (picture.url === this.last) {
+      if (performance.now() > end) throw new Error("The camera gives the same image again and again.");
+      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+      picture = this.picture();
+    }
+    this.last = picture.url;
     return picture;
   }
 
-  /** What the camera sees now: {canvas, file, time}, the time in ms since 1970. */
+  /** What the camera sees now: {canvas, file, url, time}, the time in ms since 1970. */
   picture() {
     const { videoWidth, videoHeight } = this.video;
     if (!videoWidth || !this.video.srcObject?.active) throw new Error("The camera gives no images.");
@@ -71,9 +76,10 @@ export class Webcam {
     const time = performance.timeOrigin + performance.now();
     canvas.getContext("2d", { willReadFrequently: true }).drawImage(this.video, 0, 0, width, height);
     const type = "image/jpeg";
-    const bytes = numbersOf(canvas.toDataURL(type, JPEG_QUALITY).split(",")[1], Uint8Array); // toBlob waits for an idle moment, 90 ms
+    const url = canvas.toDataURL(type, JPEG_QUALITY); // toBlob waits for an idle moment, 90 ms
+    const bytes = numbersOf(url.split(",")[1], Uint8Array);
     const file = new File([bytes], "webcam.jpg", { type });
-    return { canvas, file, time };
+    return { canvas, file, url, time };
   }
 }
 
