@@ -18,12 +18,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from msgspec.structs import replace
 from scipy.optimize import minimize
+from topoloc.localization.proposals import votes
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.fitted_weights import compute_log_odds, load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
-from topoloc.localization.proposals import votes
 from topoloc.localization.search import Search, Trace, TriedProposal
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row

@@ -30,7 +30,7 @@ from topoloc.atlas.descriptor_shard import DescriptorShard
 from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index_files import open_index
 from topoloc.atlas.manifest import PlacesFile, StoredFile, Tile
-from topoloc.retrieval.descriptor_kernels import multiply_rows
+from topoloc.retrieval.descriptor_index import multiply_rows
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 NUM_NEIGHBOURS, PLACES_A_TILE, CHUNK = 20, 250, 100_000

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization import checks
+from topoloc.localization import decision
 from topoloc.localization.answer import Answer
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.exact.pixel_evidence import (
@@ -80,7 +80,7 @@ def ask(arguments: argparse.Namespace) -> None:
     def note(query: MapQuery, answer: Answer) -> None:
         asked.append(query)
 
-    checks.CHECKS = (note, *checks.CHECKS)
+    decision.CHECKS = (note, *decision.CHECKS)
     file = arguments.map_from_truth
     map_from_truth = read_rigid(file) if file else Rigid3.identity()
     with arguments.out.open("a") as out:

@@ -234,7 +234,7 @@ def _is(answer: Answer) -> bool:
 def fit(path: str, recordings: list[str], light: float) -> None:
     """Print the figures of right poses at each step."""
     # older trees, which --beside runs, have these elsewhere
-    from topoloc.localization.proposals.propose import propose_first
+    from topoloc.localization.propose import propose_first
     from topoloc.localization.query import Deadline, QueryImage, StageClock
 
     localizer, inliers = Localizer(path), defaultdict[str, list[int]](list)

@@ -180,7 +180,7 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_other_features(
             doubt if is_doubted else None,
         )
 
-    monkeypatch.setattr("topoloc.localization.checks.check_image_calibration", doubted)
+    monkeypatch.setattr("topoloc.localization.decision.check_image_calibration", doubted)
     monkeypatch.setattr(Search, "is_settled", property(lambda search: kind == "surf"))
     result = Localizer(topomap).localize(PICTURE, CAMERA)
     assert isinstance(result, NotLocalized)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from built_room import unseen_views
 from tiny_world import CAMERA
-from topoloc.localization.checks import CHECKS
+from topoloc.localization.decision import CHECKS
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.search import Trace
 from topoloc.mapping.topomap import TopoMetricMap

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.camera import Camera
-from topoloc.localization import checks
+from topoloc.localization import decision
 from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
@@ -79,8 +79,8 @@ def test_pixels_do_not_excuse_a_wrong_focal_length(
         return wrong
 
     by_all = likely_wrong()
-    without_pixels = tuple(one for one in checks.CHECKS if one is not weigh_pixels)
-    monkeypatch.setattr(checks, "CHECKS", without_pixels)
+    without_pixels = tuple(one for one in decision.CHECKS if one is not weigh_pixels)
+    monkeypatch.setattr(decision, "CHECKS", without_pixels)
     assert by_all <= likely_wrong()
 
 

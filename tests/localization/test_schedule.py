@@ -13,12 +13,11 @@ from built_corridor import WIDE, corridor_of_two_kinds
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import MapError
-from topoloc.localization import map_query
+from topoloc.localization import map_query, propose
 from topoloc.localization.fitted_weights import NodeStop
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_query import MapQuery, verify_all
-from topoloc.localization.proposals import propose
-from topoloc.localization.proposals.propose import min_rival_inliers, propose_quick
+from topoloc.localization.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import find_best_case
 from topoloc.localization.result import Localization, NotLocalized

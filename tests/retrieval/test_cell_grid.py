@@ -20,7 +20,7 @@ from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import read_image
 from topoloc.retrieval import descriptor_index
 from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
-from topoloc.retrieval.descriptor_kernels import max_shifted_products
+from topoloc.retrieval.descriptor_index import max_shifted_products
 from topoloc.retrieval.vlad import CellGrid, SurfVlad, append_positions, learn_words, vlad
 
 NO_IMAGE = np.zeros((6, 8), np.uint8)

@@ -19,7 +19,7 @@ from topoloc.atlas.descriptor_shard import DescriptorShard
 from topoloc.errors import AtlasError
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.validation import CorruptDataError, arrays_from_npz
-from topoloc.retrieval.descriptor_kernels import multiply_rows
+from topoloc.retrieval.descriptor_index import multiply_rows
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 GlobalDescriptors = Mapping[str, Float32[np.ndarray, "_ _"]]

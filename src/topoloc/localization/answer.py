@@ -1,7 +1,7 @@
 """Turn the belief about an image into an answer, which the checks then refine or refuse.
 
 `lead` names the likeliest hypothesis of a belief, its alternatives if others rival it, or the
-reason for a refusal. Each check of `checks.py` returns a `Finding`. `Answer.after` applies it.
+reason for a refusal. Each check of `decision.py` returns a `Finding`. `Answer.after` applies it.
 """
 
 from __future__ import annotations

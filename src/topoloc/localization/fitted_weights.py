@@ -217,10 +217,10 @@ class ConfirmationWeights(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NodeStop(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold when the nodes of a map are given up (`schedule.py`).
+    """Hold when the nodes of a map are given up (`decision.py`).
 
     If the retrieved nodes give fewer than `min_inliers` inliers, a right pose would have shown
-    itself, and of other nodes only places with `min_votes` (`votes.py`) are compared. Without
+    itself, and of other nodes only places with `min_votes` (`propose.py`) are compared. Without
     `continues_earlier`, earlier feature types are not continued if this one finds no pose. The
     defaults never give up. `corpus` is what they were fitted to.
     """

@@ -7,8 +7,8 @@ The paper keeps the first pose without a check. This localizer runs one loop ove
 instead (`map_query.py`), cheapest and likeliest first. Each one is verified in the same way
 (`search.py`): it is refined and its evidence counted. It then enters the belief over hypotheses
 (`belief.py`), until the result is settled. A pose is reported only if its evidence is strong and no
-other place explains the image as well. The checks of `checks.py` then change or refuse it. A map is
-an atlas of one tile. `tiles/schedule.py` chooses tiles, and `tiles/tiles.py` compares their poses.
+other place explains the image as well. The checks of `decision.py` then change or refuse it. A map
+is an atlas of one tile. `decision.py` chooses tiles, and `tiles/tiles.py` compares their poses.
 
 These settings give the paper's own behaviour: `num_candidates=1`, `guided.num_nodes=0`,
 `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`.
@@ -30,12 +30,12 @@ from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import ResultWithInliers
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.decision import Schedule
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.query import CameraLike, Deadline, QueryImage, StageClock, camera_of
 from topoloc.localization.result import Localization, NotLocalized, R, with_time
 from topoloc.localization.search import Trace
-from topoloc.localization.tiles.schedule import Schedule
 from topoloc.localization.tiles.tiles import Reach, TileRanking, Tiles
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId

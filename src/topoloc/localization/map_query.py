@@ -20,14 +20,14 @@ from itertools import islice
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import Answer, lead
 from topoloc.localization.map_context import MapContext
-from topoloc.localization.proposals.propose import (
+from topoloc.localization.propose import (
     propose_first,
     propose_from_other_features,
     propose_node_viewpoints,
     propose_repetitions,
     propose_similar_places,
+    propose_voted_places,
 )
-from topoloc.localization.proposals.votes import propose_voted_places
 from topoloc.localization.refine import confirm_hypotheses
 from topoloc.localization.search import Proposal, Search, verify
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views

@@ -31,12 +31,14 @@ from topoloc.features.features import Features
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, VladConfig, model_array
 from topoloc.retrieval.descriptor_index import (
     DescriptorIndex,
+    add_residuals,
     learn_visual_words,
     learn_whitening,
+    max_shifted_products,
+    multiply_rows,
     pack_projection,
     unpack_projection,
 )
-from topoloc.retrieval.descriptor_kernels import add_residuals, max_shifted_products, multiply_rows
 
 DIMENSION = 32
 """Maximum length of a cell's vector after PCA."""

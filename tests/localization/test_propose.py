@@ -16,14 +16,13 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import checks, map_query
+from topoloc.localization import decision, map_query, propose
 from topoloc.localization.belief import Belief
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
 from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointMatches, PoseFit
-from topoloc.localization.proposals import propose
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import NodeProposal, is_already_found
 from topoloc.localization.result import Localization, NotLocalized
@@ -118,8 +117,8 @@ def _dark(picture: np.ndarray, light: float, seed: int) -> np.ndarray:
 def test_dark_images_are_localized_only_with_viewpoints(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
-    without_pixels = tuple(one for one in checks.CHECKS if one is not weigh_pixels)
-    monkeypatch.setattr(checks, "CHECKS", without_pixels)  # they recognise a pose with low odds
+    without_pixels = tuple(one for one in decision.CHECKS if one is not weigh_pixels)
+    monkeypatch.setattr(decision, "CHECKS", without_pixels)  # they recognise a pose with low odds
     views = [
         (_dark(picture, light, k), truth)
         for light in LIGHTS

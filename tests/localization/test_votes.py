@@ -12,11 +12,10 @@ from doubled_room import twice
 from tiny_world import CAMERA
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
-from topoloc.localization import checks, map_query
+from topoloc.localization import decision, map_query, propose
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig
 from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.proposals import votes
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
@@ -60,8 +59,8 @@ def test_votes_find_the_place_when_other_nodes_rank_first(
         assert translation_error(found.world_from_cam, truth) < 0.05
     assert "votes" in {one.source for one in trace.tried}
     monkeypatch.setattr(map_query, "propose_voted_places", lambda _: iter(()))
-    without_pixels = tuple(one for one in checks.CHECKS if one is not weigh_pixels)
-    monkeypatch.setattr(checks, "CHECKS", without_pixels)  # they recognise a pose with low odds
+    without_pixels = tuple(one for one in decision.CHECKS if one is not weigh_pixels)
+    monkeypatch.setattr(decision, "CHECKS", without_pixels)  # they recognise a pose with low odds
     lost = [localizer.localize(picture, CAMERA) for picture, _ in views]
     assert sum(isinstance(one, NotLocalized) for one in lost) >= len(views) // 2
 
@@ -70,14 +69,14 @@ def test_votes_find_the_place_when_other_nodes_rank_first(
 def test_votes_are_few_for_out_of_map_images_and_excluded_nodes_have_none(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
-    counted, count_votes = list[tuple[list[int], float]](), votes.count_votes
+    counted, count_votes = list[tuple[list[int], float]](), propose.count_votes
 
     def noting(search: Search):
         found = count_votes(search)
         counted.append(([search.map.node_ids[row] for row in found[0]], found[2].max()))
         return found
 
-    monkeypatch.setattr(votes, "count_votes", noting)
+    monkeypatch.setattr(propose, "count_votes", noting)
     localizer = Localizer(room, coarse=OtherRoomFirst(room))
     for picture, _ in unseen_views():
         localizer.localize(picture, CAMERA)
@@ -100,6 +99,6 @@ def test_a_blank_image_has_no_place(room: TopoMetricMap):
 def test_an_image_whose_retrieved_nodes_agree_by_chance_costs_no_votes(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(votes, "count_votes", lambda _: pytest.fail("votes were counted"))
+    monkeypatch.setattr(propose, "count_votes", lambda _: pytest.fail("votes were counted"))
     for picture, _ in unseen_views(seed=1, step=4.0):
         assert isinstance(Localizer(room).localize(picture, CAMERA), NotLocalized)
