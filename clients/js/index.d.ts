@@ -87,6 +87,16 @@ export interface ResultOfMaps {
 /** The bytes of an image file: JPEG, PNG, WebP ... */
 export type Image = Blob | ArrayBuffer | ArrayBufferView;
 
+/** A text at a place of a map. `geopose` only if the map has a place on earth. */
+export interface Note {
+  id: string;
+  text: string;
+  created: string;
+  /** Metres, axes of the map's world. */
+  position: [number, number, number];
+  geopose?: GeoPose;
+}
+
 export interface Cancel {
   signal?: AbortSignal;
 }
@@ -172,6 +182,13 @@ export class TopolocClient {
   localizeEverywhere(image: Image, fields?: Fields): Promise<ResultOfMaps>;
   /** Why an image has this result. */
   explain(map: string, image: Image, fields?: Fields): Promise<Record<string, unknown>>;
+  /** A map for display: points, nodes and paths, as docs/viewer.md describes. */
+  scene(map: string, options?: Cancel): Promise<Record<string, unknown>>;
+  /** The oldest first. */
+  notes(map: string, options?: Cancel): Promise<Note[]>;
+  /** The id of the note. `position` in metres, axes of the map's world. */
+  addNote(map: string, text: string, position: ArrayLike<number> & Iterable<number>, options?: Cancel): Promise<string>;
+  removeNote(map: string, id: string, options?: Cancel): Promise<void>;
   /** Localize on earth by the OSCP GeoPose Protocol. */
   geopose(image: Image, facts?: GeoPoseFacts & Cancel & { map?: string }): Promise<GeoPoseFound | GeoPoseRefused>;
   stream(map: string, options?: Cancel & { camera?: string | object; transport?: "websocket" | "http" }): Promise<Stream>;

@@ -47,6 +47,24 @@ export class TopolocClient {
     return this.#post(`${mapPath(map)}/explain`, image, fields, signal);
   }
 
+  scene(map, { signal } = {}) {
+    return this.#json(`${mapPath(map)}/scene`, {}, signal);
+  }
+
+  async notes(map, { signal } = {}) {
+    return (await this.#json(`${mapPath(map)}/notes`, {}, signal)).notes;
+  }
+
+  async addNote(map, text, position, { signal } = {}) {
+    const headers = { "content-type": "application/json" };
+    const body = JSON.stringify({ text, position: [...position] });
+    return (await this.#json(`${mapPath(map)}/notes`, { method: "POST", body, headers }, signal)).id;
+  }
+
+  async removeNote(map, id, { signal } = {}) {
+    await this.#json(`${mapPath(map)}/notes/${encodeURIComponent(id)}`, { method: "DELETE" }, signal);
+  }
+
   async geopose(image, { map, signal, ...facts } = {}) {
     const body = JSON.stringify(await geoposeRequest(image, facts));
     const headers = { "content-type": "application/json", accept: GEOPOSE_TYPE };

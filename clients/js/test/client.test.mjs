@@ -5,6 +5,10 @@ import { test } from "node:test";
 import { geoposeRequest, TopolocClient, TopolocError } from "../index.js";
 
 const { TOPOLOC_URL, TOPOLOC_TOKEN, TOPOLOC_IMAGE, TOPOLOC_CAMERA } = process.env;
+if (!TOPOLOC_URL) {
+  console.error("these tests ask a service: run `pytest tests/apps/service/test_js_client.py`, or start one and set TOPOLOC_URL, TOPOLOC_TOKEN, TOPOLOC_IMAGE (a file) and TOPOLOC_CAMERA (JSON)");
+  process.exit(1);
+}
 const client = new TopolocClient(`${TOPOLOC_URL}/`, { token: TOPOLOC_TOKEN });
 const image = await readFile(TOPOLOC_IMAGE);
 const camera = JSON.parse(TOPOLOC_CAMERA);
@@ -17,6 +21,19 @@ test("maps and their facts", async () => {
   const facts = await client.map("earth");
   assert.equal(facts.name, "earth");
   assert.ok(facts.nodes.length > 1);
+});
+
+test("a scene and the notes of a map", async () => {
+  const scene = await client.scene("earth");
+  assert.ok(scene.nodes.length > 1);
+  const id = await client.addNote("earth", " A door ", new Float32Array([0.5, 0, 2]));
+  const note = (await client.notes("earth")).find((one) => one.id === id);
+  assert.equal(note.text, "A door");
+  assert.ok(note.position.every((metres, axis) => Math.abs(metres - [0.5, 0, 2][axis]) < 1e-9));
+  await client.removeNote("earth", id);
+  assert.equal((await client.notes("earth")).some((one) => one.id === id), false);
+  await assert.rejects(client.removeNote("earth", id), { status: 404 });
+  await assert.rejects(client.addNote("earth", "", [0, 0, 0]), { status: 422 });
 });
 
 test("an image is localized, given as Blob, bytes or buffer", async () => {

@@ -75,7 +75,7 @@ class EncodedImage:
 
 
 def read_image(
-    path: Path | EncodedImage,
+    path: str | Path | EncodedImage,
     as_stored: bool = False,
     white: int | None = None,
     max_pixels: int = MAX_PIXELS,
@@ -103,7 +103,7 @@ def read_image(
         return np.array(picture if picture.mode == "RGB" else picture.convert("RGB"))
 
 
-def _decode_webp(path: Path | EncodedImage, factor: int) -> Image:
+def _decode_webp(path: str | Path | EncodedImage, factor: int) -> Image:
     """Decode a WebP image with OpenCV, which takes a third of Pillow's memory."""
     flags = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
     flag = flags.get(factor, cv2.IMREAD_REDUCED_COLOR_8) | cv2.IMREAD_IGNORE_ORIENTATION
@@ -131,7 +131,9 @@ def _white_level(values: UInt16[np.ndarray, "h w"]) -> int:
     return next(white for white in (1023, 4095, 16383, 65535) if values.max(initial=0) <= white)
 
 
-def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
+def read_depth(
+    path: str | Path | EncodedImage, units_per_metre: float
+) -> Float32[np.ndarray, "h w"]:
     """Read a depth image of 16 or 32 bits, or of floats (TIFF), in metres. Unknown depth is NaN (0
     in the file, and 65535 of 16 bits).
 
@@ -206,11 +208,11 @@ def _exif_number(value: Any) -> float:
     return number if math.isfinite(number) else 0.0
 
 
-def _read_bytes(path: Path | EncodedImage) -> bytes:
+def _read_bytes(path: str | Path | EncodedImage) -> bytes:
     try:
         if isinstance(path, EncodedImage):
             return path.data
-        path = find_path(path)
+        path = find_path(Path(path))
         # Reading a FIFO would block.
         if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
             raise UnreadableImageError(f"{path}: not a file")
@@ -227,7 +229,7 @@ def _read_bytes(path: Path | EncodedImage) -> bytes:
 
 
 @contextmanager
-def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
+def _open_image(path: str | Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
     """Yield the image with its header read. Errors of damaged files raised in the body become
     UnreadableImageError."""
     data = _read_bytes(path)
@@ -261,7 +263,7 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
 
 @contextmanager
 def _decode_image(
-    path: Path | EncodedImage, as_stored: bool = False, max_pixels: int = MAX_PIXELS
+    path: str | Path | EncodedImage, as_stored: bool = False, max_pixels: int = MAX_PIXELS
 ) -> Iterator[Pillow.Image]:
     with _open_image(path) as picture:
         factor = _reduction(picture, max_pixels)
@@ -285,7 +287,7 @@ def _orientation(picture: Pillow.Image) -> int:
     return picture.getexif().get(ExifTags.Base.Orientation, 1)
 
 
-def _supported_types(path: Path | EncodedImage, data: bytes) -> tuple[str, ...]:
+def _supported_types(path: str | Path | EncodedImage, data: bytes) -> tuple[str, ...]:
     """Return the types to try. HEIF is included only for its first bytes, because its decoder is an
     extra."""
     if data[4:8] != b"ftyp" or data[8:12] not in (b"heic", b"heix", b"heim", b"heis", b"mif1"):

@@ -87,7 +87,7 @@ class Trajectory:
         return Trajectory(lazy_poses(rows, pose_from_quaternion), t_ns)
 
     @staticmethod
-    def read(path: Path) -> Trajectory:
+    def read(path: str | Path) -> Trajectory:
         """Read a TUM file (8 columns), KITTI rows (12 columns), poses by name, or a folder of
         matrices (`named_poses.py`). TUM times are in seconds, or in nanoseconds if they are large.
 
@@ -95,6 +95,7 @@ class Trajectory:
             TrajectoryError: the file is missing or empty, the number of columns is wrong, a number
                 is NaN, a rotation is invalid, or times do not increase. Names the line.
         """
+        path = Path(path)
         if path.is_dir():
             return _named_trajectory(read_pose_folder(path))
         return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
@@ -114,7 +115,7 @@ class Trajectory:
         return [_interpolate_pose(self.t_ns, poses, time, gap_ns) for time in t_ns]
 
     def match_frames(
-        self, t_ns: Sequence[int], path: Path, names: Sequence[str] = ()
+        self, t_ns: Sequence[int], path: str | Path, names: Sequence[str] = ()
     ) -> list[Rigid3 | None]:
         """Return the pose of each frame by time, or by row or name if the trajectory has no times.
         Times that are the numbers of the frames (`names`) count as such; a warning says so.
@@ -124,7 +125,7 @@ class Trajectory:
                 `path` and a likely difference of the clocks.
         """
         if self.by_name is not None:
-            return match_names(self.by_name, names, path)
+            return match_names(self.by_name, names, Path(path))
         if self.t_ns is None:
             if len(self) != len(t_ns):
                 raise TrajectoryError(f"{path}: {len(self)} poses for {len(t_ns)} frames")
@@ -153,11 +154,11 @@ class Trajectory:
         rows = map(tum_line, self.t_ns, self.world_from_cam)
         return "".join(f"{line}\n" for line in [*([TUM_HEADER] if header else []), *rows])
 
-    def write_tum(self, path: Path, are_answers: bool = False) -> None:
+    def write_tum(self, path: str | Path, are_answers: bool = False) -> None:
         """Write a TUM file atomically. With `are_answers` its first line says that a map answered
         these poses, so that they are nobody's ground truth (`has_answers`). Raises TrajectoryError
         if the trajectory has no times, and TopolocError if the file cannot be written."""
-        write_text(path, f"{_ANSWERS_HEADER}\n" * are_answers + self.to_tum())
+        write_text(Path(path), f"{_ANSWERS_HEADER}\n" * are_answers + self.to_tum())
 
 
 def has_answers(path: Path) -> bool:
@@ -223,7 +224,7 @@ def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
 
 
 def with_trajectory(
-    sequence: StereoSequence, path: Path, conventions: PoseConventions | None = None
+    sequence: StereoSequence, path: str | Path, conventions: PoseConventions | None = None
 ) -> StereoSequence:
     """Return the recording with the poses of a trajectory file: TUM by time, KITTI rows by frame,
     rows with names and folders of matrices by name.
@@ -262,7 +263,7 @@ def with_pose_conventions(sequence: StereoSequence, conventions: PoseConventions
     return with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
-def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
+def align_to_trajectory(sequence: StereoSequence, path: str | Path) -> StereoSequence:
     """Return the recording in the world of a trajectory file, in metres: its own poses, moved and
     scaled to fit best.
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from running_service import Running
+from running_service import SIGNED_TOKEN, Running
 
 from topoloc import AsyncClient, Camera, Client, Localization, Localizer, TopoMetricMap
 from topoloc.errors import ServiceError
@@ -67,6 +68,30 @@ def test_the_same_in_an_event_loop(service: Running, view: Path, camera: str):
             return [result.localized for result in results]
 
     assert asyncio.run(ask()) == [True] * 5
+
+
+def test_a_scene_and_the_notes_of_a_map(open_service: Running):
+    async def take_back(note_id: str) -> list[dict[str, Any]]:
+        async with AsyncClient(open_service.url, SIGNED_TOKEN) as client:
+            assert (await client.scene("earth"))["nodes"]
+            other = await client.add_note("earth", "A window", (0.0, 0.0, 1.0))
+            await client.remove_note("earth", note_id)
+            left = await client.notes("earth")
+            await client.remove_note("earth", other)
+            return left
+
+    with Client(open_service.url, SIGNED_TOKEN) as client:
+        assert len(client.scene("earth")["nodes"]) == client.map("earth")["num_nodes"]
+        note_id = client.add_note("earth", " A door ", np.array([0.5, 0.0, 2.0]))
+        (note,) = client.notes("earth")
+        assert (note["id"], note["text"]) == (note_id, "A door")
+        assert np.allclose(note["position"], [0.5, 0.0, 2.0])
+        assert [one["text"] for one in asyncio.run(take_back(note_id))] == ["A window"]
+        assert client.notes("earth") == []
+        with pytest.raises(ServiceError, match="404"):
+            client.remove_note("earth", note_id)
+        with pytest.raises(ServiceError, match="position"):
+            client.add_note("earth", "A door", [0.0, 0.0])
 
 
 def test_errors_are_one_line(service: Running, view: Path):

@@ -48,7 +48,14 @@ def test_it_queries_a_service(open_service: Running, view: Path, camera: str):
         TOPOLOC_IMAGE=str(view),
         TOPOLOC_CAMERA=camera,
     )
-    assert "# pass 9\n" in printed
+    assert "# pass 10\n" in printed
+
+
+def test_its_tests_name_the_command_that_starts_a_service():
+    npm = shutil.which("npm") or pytest.skip("npm is not installed")
+    done = subprocess.run([npm, "test"], cwd=CLIENT, capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0
+    assert "pytest tests/apps/service/test_js_client.py" in done.stdout + done.stderr
 
 
 _IN_A_PAGE = """async ([url, token, base64]) => {

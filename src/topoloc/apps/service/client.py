@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -14,12 +14,14 @@ from urllib.parse import quote
 
 import httpx
 import numpy as np
+from jaxtyping import Float
 
 from topoloc import Camera, Localization, NotLocalized, Rigid3, ServiceError, result_from_json
 
 ImageInput = str | Path | bytes | np.ndarray
 CameraSpec = Camera | str | None
 """A camera, or a camera option of the service: `map`, `unknown`, `exif`, `fx,fy,cx,cy`."""
+Position = Sequence[float] | Float[np.ndarray, " 3"]
 _MAX_TRIES, _MAX_WAIT_S = 5, 10.0
 
 
@@ -89,6 +91,26 @@ class Client:
         ServiceError."""
         return self._send(_image_request(map, "/explain", image, camera))
 
+    def scene(self, map: str) -> dict[str, Any]:
+        """Return a map for display: points, nodes and paths, as docs/viewer.md describes. Raises
+        ServiceError."""
+        return self._send(_get_request(map, "/scene"))
+
+    def notes(self, map: str) -> list[dict[str, Any]]:
+        """Return the notes of a map, the oldest first: `id`, `text`, `created`, `position` (metres,
+        axes of the map's world), and `geopose` if the map has a place on earth. Raises
+        ServiceError."""
+        return self._send(_get_request(map, "/notes"))["notes"]
+
+    def add_note(self, map: str, text: str, position: Position) -> str:
+        """Add a note at a position (metres, axes of the map's world), and return its id. Raises
+        ServiceError."""
+        return self._send(_note_request(map, text, position))["id"]
+
+    def remove_note(self, map: str, note_id: str) -> None:
+        """Delete a note. Raises ServiceError: there is no such note."""
+        self._send(_get_request(map, f"/notes/{quote(note_id, safe='')}") | {"method": "DELETE"})
+
     def _send(self, request: dict[str, Any]) -> Any:
         attempts = count(1)
         while True:
@@ -146,6 +168,23 @@ class AsyncClient:
         """As `Client.explain`."""
         return await self._send(_image_request(map, "/explain", image, camera))
 
+    async def scene(self, map: str) -> dict[str, Any]:
+        """As `Client.scene`."""
+        return await self._send(_get_request(map, "/scene"))
+
+    async def notes(self, map: str) -> list[dict[str, Any]]:
+        """As `Client.notes`."""
+        return (await self._send(_get_request(map, "/notes")))["notes"]
+
+    async def add_note(self, map: str, text: str, position: Position) -> str:
+        """As `Client.add_note`."""
+        return (await self._send(_note_request(map, text, position)))["id"]
+
+    async def remove_note(self, map: str, note_id: str) -> None:
+        """As `Client.remove_note`."""
+        note = f"/notes/{quote(note_id, safe='')}"
+        await self._send(_get_request(map, note) | {"method": "DELETE"})
+
     async def _send(self, request: dict[str, Any]) -> Any:
         attempts = count(1)
         while True:
@@ -161,12 +200,18 @@ def _client_options(url: str, token: str | None, timeout_s: float) -> dict[str, 
     return {"base_url": url, "headers": headers, "timeout": timeout_s}
 
 
-def _get_request(map: str | None = None) -> dict[str, Any]:
-    """Return the arguments of httpx's `request` for a map, or for the list of maps."""
+def _get_request(map: str | None = None, part: str = "") -> dict[str, Any]:
+    """Return the arguments of httpx's `request` for a map or a part of it, or for the list of
+    maps."""
     return {
         "method": "GET",
-        "url": "/v1/maps" if map is None else f"/v1/maps/{quote(map, safe='')}",
+        "url": "/v1/maps" if map is None else f"/v1/maps/{quote(map, safe='')}{part}",
     }
+
+
+def _note_request(map: str, text: str, position: Position) -> dict[str, Any]:
+    note = {"text": text, "position": np.asarray(position, float).tolist()}
+    return _get_request(map, "/notes") | {"method": "POST", "json": note}
 
 
 def _image_request(
@@ -188,7 +233,7 @@ def _image_request(
     }
     return {
         "method": "POST",
-        "url": f"/v1{action}" if map is None else _get_request(map)["url"] + action,
+        "url": f"/v1{action}" if map is None else _get_request(map, action)["url"],
         "data": {name: value for name, value in data.items() if value is not None},
         "files": {"image": _encode_image(image)},
     }
@@ -216,6 +261,8 @@ def _retry_delay_s(response: httpx.Response, attempt: int) -> float | None:
 
 
 def _parse_response(response: httpx.Response) -> Any:
+    if response.status_code == 204:
+        return None
     try:
         data = response.json()
     except ValueError:
