@@ -108,6 +108,25 @@ def test_pycolmap_reads_the_model_and_its_tracks_fit(room_map: Path, scene: Scen
     assert model["camera"] == [list(scene.views[0].camera.to_colmap()[3])]
 
 
+def test_the_binary_form_of_a_colmap_model_is_its_text(room_map: Path, tmp_path: Path):
+    whole = export(room_map, tmp_path / "model")
+    models = []
+    for suffix in (".bin", ".txt"):
+        folder = tmp_path / suffix
+        folder.mkdir()
+        for file in whole.glob(f"*{suffix}"):
+            (folder / file.name).write_bytes(file.read_bytes())
+        assert len(list(folder.iterdir())) == 5
+        models.append(colmap_of(folder))
+    binary, text = models
+    assert binary["camera"] == text["camera"]
+    assert binary["images"].keys() == text["images"].keys()
+    for name, image in text["images"].items():
+        np.testing.assert_allclose(binary["images"][name]["centre"], image["centre"], atol=1e-12)
+    for key in ("rgb", "tracks", "num_rigs", "num_frames", "error"):
+        np.testing.assert_allclose(np.ravel(binary[key]), np.ravel(text[key]), atol=1e-5)
+
+
 def test_pycolmap_reads_results(results: Path, tmp_path: Path):
     lines = [json.loads(line) for line in results.read_text().splitlines()]
     model = colmap_of(export(results, tmp_path / "model"))
