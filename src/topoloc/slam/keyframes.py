@@ -203,7 +203,8 @@ def triangulate_points(
     for keyframe, of_it, points_img in zip(keyframes, rows_of_each, pixels_of_each, strict=True):
         projected = keyframe.stereo.project(keyframe.cam_from_world.apply(points[of_it]))[:, :2]
         distances = np.linalg.norm(projected - points_img, axis=1)
-        np.maximum.at(worst, of_it, np.nan_to_num(distances, nan=np.inf))
+        with np.errstate(invalid="ignore"):  # points that cannot be triangulated stay NaN
+            np.maximum.at(worst, of_it, np.nan_to_num(distances, nan=np.inf))
     return points, num_rays, parallax, worst
 
 

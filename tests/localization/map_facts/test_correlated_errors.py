@@ -11,6 +11,7 @@ import pytest
 
 import topoloc
 from built_room import built_room
+from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.answer import shape_as_motion
@@ -20,6 +21,7 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts import correlated_errors
 from topoloc.localization.map_facts.correlated_errors import (
     ErrorShareMeasurement,
+    MeasuredPoses,
 )
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -57,15 +59,31 @@ def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(
     assert _rho(_disturbed(topomap, 0.02, 0.005)) > 10.0 * max(exact, WEIGHTS.least)
 
 
+def test_corrected_nodes_share_the_errors_of_the_poses_that_were_measured(
+    tiny_recording: Path, monkeypatch: pytest.MonkeyPatch
+):
+    topomap = built_room(tiny_recording)
+    monkeypatch.setitem(correlated_errors._SETTINGS, "min_nodes", 3)
+    c = LocalizerConfig().for_feature_type(find_feature_type("surf"))
+    share = ErrorShareMeasurement(topomap, "surf", c.guided, c.pose, WEIGHTS)
+    given = {
+        (one.session_id, one.name): one.world_from_cam
+        for one in _disturbed(topomap, 0.02, 0.005).summaries
+    }
+    assert share.measure(given) > 10.0 * max(share.measure(), WEIGHTS.least)
+
+
 @pytest.fixture
 def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
     """Return the list of maps that are measured from now on."""
     measured: list[TopoMetricMap] = []
     measure = ErrorShareMeasurement.measure
 
-    def told(measurement: ErrorShareMeasurement) -> float:
+    def told(
+        measurement: ErrorShareMeasurement, measured_poses: MeasuredPoses | None = None
+    ) -> float:
         measured.append(measurement.topomap)
-        return measure(measurement)
+        return measure(measurement, measured_poses)
 
     monkeypatch.setattr(ErrorShareMeasurement, "measure", told)
     return measured

@@ -15,14 +15,16 @@ measured again.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 from msgspec import to_builtins
 
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.fitted_weights import CorrelatedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.pose_fit import LocalMap
@@ -31,6 +33,8 @@ from topoloc.mapping.storage.entries import CorrelatedErrors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import as_rows
 
+MeasuredPoses: TypeAlias = Mapping[tuple[int, str], Rigid3]
+"""Poses (world_from_cam) by session and name of the image."""
 _MEDIAN_CHI_SQUARE_6 = 5.348
 _METHOD = 1  # part of the digest: increase if the same settings give another rho
 
@@ -78,8 +82,9 @@ class ErrorShareMeasurement:
         """Return rho of these or nearly the same nodes, to be stored in the map."""
         return CorrelatedErrors(rho, self._digest())
 
-    def measure(self) -> float:
-        """Measure rho."""
+    def measure(self, measured_poses: MeasuredPoses | None = None) -> float:
+        """Measure rho. Nodes are compared with `measured_poses` instead of their own, if these
+        have one: poses that images corrected agree among each other better than with the world."""
         poses, config = self.topomap.node_poses, self.topomap.config
         nodes = self.topomap.layers[self.kind].nodes
         rows = np.linspace(0, len(self.topomap.summaries) - 1, _SETTINGS["num_nodes"])
@@ -92,7 +97,9 @@ class ErrorShareMeasurement:
                 order = np.argsort(distances, kind="stable")
                 is_far = distances[order] > min_distance * config.d_thresh
                 helpers = order[is_far][: _SETTINGS["num_helpers"]]
-                rho = self._measure_at_node(nodes[row], [nodes[int(k)] for k in helpers])
+                rho = self._measure_at_node(
+                    nodes[row], [nodes[int(k)] for k in helpers], measured_poses or {}
+                )
                 if rho is not None:
                     rhos.append(rho)
             if len(rhos) >= _SETTINGS["min_nodes"]:
@@ -112,7 +119,9 @@ class ErrorShareMeasurement:
             self.topomap.summaries, json.dumps([_METHOD, settings], sort_keys=True).encode()
         )
 
-    def _measure_at_node(self, node: TopoNode, helpers: list[TopoNode]) -> float | None:
+    def _measure_at_node(
+        self, node: TopoNode, helpers: list[TopoNode], measured_poses: MeasuredPoses
+    ) -> float | None:
         """Estimate rho from the pose of one node, localized with the points of `helpers`.
 
         None if they have too few points in common.
@@ -120,7 +129,9 @@ class ErrorShareMeasurement:
         if not helpers:
             return None
         min_inliers = _SETTINGS["min_inliers"]
-        cam_from_world = node.summary.world_from_cam.inverse()
+        summary = node.summary
+        world_from_cam = measured_poses.get((summary.session_id, summary.name))
+        cam_from_world = (world_from_cam or summary.world_from_cam).inverse()
         local_map = LocalMap.concatenate([LocalMap.of_node(helper) for helper in helpers])
         matches = match_guided(node.features, local_map, cam_from_world, node.camera, self.guided)
         if len(matches) < min_inliers:

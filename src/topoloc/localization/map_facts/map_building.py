@@ -18,7 +18,10 @@ from topoloc.geometry.transform_consensus import select_hypothesis
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import load_fitted_weights
-from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement
+from topoloc.localization.map_facts.correlated_errors import (
+    ErrorShareMeasurement,
+    MeasuredPoses,
+)
 from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.mapping import build
 from topoloc.mapping.config import Progress
@@ -28,10 +31,11 @@ from topoloc.node_ids import NodeId
 from topoloc.recordings.depth_range import leave_out_stuck_depth
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import keep_frames, leave_out_damaged
+from topoloc.recordings.recording import find_pose_source, keep_frames, leave_out_damaged
 from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.input_checks import check_pose_coverage, check_stereo
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view
+from topoloc.slam.pose_adjustment import correct_poses
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
 from topoloc.slam.still_part import find_still_part
@@ -94,18 +98,33 @@ def build_map(
             check_poses(sequence)
     for note in check_common_world(given) if are_poses_checked else []:
         warn(note)
-    return with_map_statistics(
-        build.build_node_map(sequences, config, progress, poses_from), progress
-    )
+    poses_from = poses_from or [find_pose_source(sequence) for sequence in sequences]
+    measured = {
+        (number, name): pose
+        for number, sequence in enumerate(sequences)
+        for name, pose in zip(sequence.names, sequence.poses, strict=True)
+        if pose is not None
+    }
+    if are_poses_checked:
+        sequences = [
+            correct_poses(one, warn) if any(one is k for k in given) else one for one in sequences
+        ]
+    built = build.build_node_map(sequences, config, progress, poses_from)
+    return with_map_statistics(built, progress, measured)
 
 
-def with_map_statistics(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:
+def with_map_statistics(
+    topomap: TopoMetricMap,
+    progress: Progress | None = None,
+    measured_poses: MeasuredPoses | None = None,
+) -> TopoMetricMap:
     """Return the map with its statistics (correlated errors, repetitions).
 
-    A localizer then reads them instead of measuring them.
+    A localizer then reads them instead of measuring them. `measured_poses` are those that were
+    given, where the map's are corrected by the images: the errors of the map are in their world.
     """
     layers = {
-        kind: replace(layer, shared_errors=_measure_error_share(topomap, kind))
+        kind: replace(layer, shared_errors=_measure_error_share(topomap, kind, measured_poses))
         for kind, layer in topomap.layers.items()
     }
     return with_repetitions(replace(topomap, layers=layers, repetitions=None), progress)
@@ -122,10 +141,12 @@ def carry_over_error_shares(topomap: TopoMetricMap, before: TopoMetricMap) -> To
     return replace(topomap, layers={**topomap.layers, **layers}, repetitions=None)
 
 
-def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
+def _measure_error_share(
+    topomap: TopoMetricMap, kind: str, measured_poses: MeasuredPoses | None
+) -> CorrelatedErrors:
     """Measure rho of a map for a feature type."""
     share = _error_share_of(topomap, kind)
-    return share.with_digest(share.measure())
+    return share.with_digest(share.measure(measured_poses))
 
 
 def _error_share_of(topomap: TopoMetricMap, kind: str) -> ErrorShareMeasurement:
