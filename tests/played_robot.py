@@ -95,7 +95,6 @@ class PlayedRobot:
         read("/tf", ros.TFMessage, "reliable", self._hear_tf)
         read("/topoloc/pose", ros.PoseWithCovarianceStamped, "reliable", self._hear_pose)
         read("/diagnostics", ros.DiagnosticArray, "reliable", self._hear_status)
-        self._node.start()
         self.start_ns = 0
         self.steps: list[Step] = []
         self.odometry: list[Rigid3] = []

@@ -19,5 +19,5 @@ setup(
         ),
     ],
     install_requires=["setuptools", "topoloc"],
-    entry_points={"console_scripts": [f"localizer = {NAME}.node:main"]},
+    entry_points={"console_scripts": [f"localizer = {NAME}.lifecycle_node:main"]},
 )

@@ -14,6 +14,8 @@ def generate_launch_description() -> LaunchDescription:
         "map": ("", "The map file."),
         "image": ("/camera/image_raw", "The topic of the images."),
         "use_sim_time": ("false", "Take the time from /clock."),
+        "simulated": ("false", "The images are of a simulator without noise."),
+        "autostart": ("true", "Configure and activate the node without a manager."),
     }
     arguments = [
         DeclareLaunchArgument(name, default_value=value, description=text)

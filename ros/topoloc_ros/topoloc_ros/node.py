@@ -1,17 +1,12 @@
-"""The localizer as a node of rclpy, for middlewares other than DDS and for launch files with
-parameters. `topoloc follow --ros` does the same without ROS."""
+"""The topics of topoloc by a node of rclpy, in place of DDS."""
 
 from __future__ import annotations
 
-import sys
-import threading
 from collections import deque
 from collections.abc import Callable
-from contextlib import closing, suppress
 from types import SimpleNamespace
 from typing import Any
 
-import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import (
@@ -24,19 +19,14 @@ from geometry_msgs.msg import (
     TransformStamped,
     Vector3,
 )
-from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from topoloc import Localizer, TopolocError, Tracker
-from topoloc.apps.cli.features_option import parse_camera
-from topoloc.apps.robots.robot_localizer import RobotLocalizer
-from topoloc.apps.robots.ros_images import RosImages
 from topoloc.apps.robots.ros_node import RosNode, TopicReader
-from topoloc_ros.parameters import OWN, by_position, robot_config, setting_names
+from topoloc_ros.parameters import by_position
 
 _MADE = (
     Time, Header, Point, Vector3, Quaternion, Pose, PoseWithCovariance, PoseWithCovarianceStamped,
@@ -66,16 +56,17 @@ class _Queue(TopicReader):
 
 
 class RclpyNode(RosNode):
-    """The topics of a node of rclpy, which a thread of `start` spins."""
+    """The topics of a node of rclpy, which its executor calls back, until they are closed."""
 
     def __init__(self, node: Any) -> None:
         self._node, self.domain = node, node.context.get_domain_id()
         kinds = {kind.__name__: _Made(kind) for kind in _MADE}
         self.messages = SimpleNamespace(**kinds, **{kind.__name__: kind for kind in _READ})
-        self._thread = threading.Thread(target=self._spin_node, name="ros", daemon=True)
+        self._ends = list[Callable[[], Any]]()
 
     def create_writer(self, name: str, kind: Any) -> Callable[[Any], None]:
         publisher = self._node.create_publisher(kind.kind, name, 10)
+        self._ends.append(lambda: self._node.destroy_publisher(publisher))
         return publisher.publish
 
     def create_reader(
@@ -91,51 +82,14 @@ class RclpyNode(RosNode):
             profile.reliability = ReliabilityPolicy.BEST_EFFORT
         if quality == "latched":
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        kind = kind.kind if isinstance(kind, _Made) else kind
-        self._node.create_subscription(kind, name, callback or queue.arrived.append, profile)
+        kind, take = (
+            kind.kind if isinstance(kind, _Made) else kind,
+            callback or queue.arrived.append,
+        )
+        reader = self._node.create_subscription(kind, name, take, profile)
+        self._ends.append(lambda: self._node.destroy_subscription(reader))
         return queue
 
-    def start(self) -> None:
-        self._thread.start()
-
     def close(self) -> None:
-        self._node.destroy_node()
-
-    def _spin_node(self) -> None:
-        with suppress(ExternalShutdownException):
-            rclpy.spin(self._node)
-
-
-def main() -> None:
-    """Run the node until it is told to end."""
-    rclpy.init()
-    node = rclpy.create_node("topoloc")
-    try:
-        _follow(node)
-    except TopolocError as error:
-        node.get_logger().fatal(str(error))
-        sys.exit(1)
-    finally:
-        rclpy.try_shutdown()
-
-
-def _follow(node: Any) -> None:
-    own = {name: node.declare_parameter(name, value).value for name, value in OWN.items()}
-    defaults = {name: getattr(robot_config({}), name) for name in setting_names()}
-    given = {name: node.declare_parameter(name, value).value for name, value in defaults.items()}
-    given["use_sim_time"] = node.get_parameter("use_sim_time").value
-    warn, stop = node.get_logger().warning, threading.Event()
-    node.context.on_shutdown(stop.set)
-    localizer, ros = Localizer(own["map"]), RclpyNode(node)
-    of_size = parse_camera(localizer, own["camera"]) if own["camera"] else None
-    images = RosImages(ros, f"ros:{own['image']}", of_size is not None, warn)
-    with (
-        closing(Tracker(localizer)) as tracker,
-        closing(RobotLocalizer(ros, robot_config(given), images, warn)) as robot,
-    ):
-        for frame in images.frames(stop):
-            robot.localize(frame, tracker, of_size)
-
-
-if __name__ == "__main__":
-    main()
+        while self._ends:
+            self._ends.pop()()

@@ -11,9 +11,16 @@ from topoloc import ConfigError
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.plugin import with_setting
 
-OWN = {"map": "", "image": "/camera/image_raw", "camera": ""}
-"""Parameters of the node itself, with their defaults: the map file, the topic of the images, and
-the calibration if there is no camera_info."""
+OWN = {
+    "map": "",
+    "image": "/camera/image_raw",
+    "camera": "",
+    "simulated": False,
+    "autostart": True,
+}
+"""Parameters of the node itself, with their defaults: the map file, the topic of the images, the
+calibration if there is no camera_info, whether a simulator without noise renders the images, and
+whether the node configures and activates itself."""
 _OF_ROS = ("domain", "namespace", "use_sim_time")  # which ROS gives each node itself
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from itertools import islice
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from topoloc.apps.formats.bags import bag_images
 from topoloc.apps.robots import ros_images
 from topoloc.apps.robots.ros_images import RosImages
 from topoloc.apps.robots.ros_node import RosNode, TopicReader
@@ -243,3 +246,29 @@ def test_right_labels_are_trusted(label: str, is_yuyv: bool):
 def test_an_invalid_topic_is_refused(topic: str):
     with pytest.raises(RecordingError, match="no topic of ROS"):
         RosImages(Node(), f"ros:{topic}", True, print)
+
+
+def test_the_table_of_encodings_is_that_of_the_code():
+    """32FC1 is depth, which no image of a camera is."""
+    text = (Path(__file__).parents[3] / "docs" / "robots.md").read_text(encoding="utf-8")
+    section = re.search(r"^\*\*Encodings\.\*\*.*?\n\n(.*?)\n\n", text, re.MULTILINE | re.DOTALL)
+    assert section
+    rows = [row.split("|")[1] for row in section.group(1).splitlines()[2:]]
+    documented = [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+    known = bag_images._ENCODINGS  # pyright: ignore[reportPrivateUsage]
+    assert sorted(documented) == sorted(set(known) - {"32FC1"})
+
+
+@pytest.mark.parametrize("encoding", ["mono16", "16UC1"])
+def test_grey_of_16_bits_is_stretched_to_8(encoding: str):
+    message = _image(1, RGB[..., 0].astype(np.uint16) * 200, encoding)
+    message.header, message.step = _header(1), 2 * WIDTH
+    message.data = (RGB[..., 0].astype("<u2") * 200).tobytes()
+    images, _, warnings = _open([message])
+    (frame,) = islice(images.frames(threading.Event()), 1)
+    image = frame.read().image
+    assert (image.dtype, image.shape) == (np.uint8, (HEIGHT, WIDTH))
+    order = np.argsort(RGB[..., 0], axis=None, kind="stable")
+    assert np.all(np.diff(image.ravel()[order].astype(int)) >= 0)
+    assert int(image.max()) - int(image.min()) > 100
+    assert warnings == []

@@ -7,16 +7,19 @@ import ast
 import importlib
 import runpy
 import sys
+import time
 import types
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
+from tiny_world import CAMERA, path_pose, render, room
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.robot_localizer import RobotLocalizer
 from topoloc.apps.robots.ros_node import RobotPublisher
@@ -100,18 +103,66 @@ def test_rviz_shows_the_pose_and_sets_the_initial_one():
 
 
 class Topics:
-    """Stand in for a node of rclpy and store the published messages."""
+    """Stand in for a node of rclpy and store the published messages. `heard` has the callbacks of
+    its subscriptions."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "topoloc") -> None:
         self.sent: dict[str, list[Any]] = {}
+        self.publishers: list[Any] = []
         self.heard: dict[str, Callable[[Any], None]] = {}
         self.context = types.SimpleNamespace(get_domain_id=lambda: 7)
 
     def create_publisher(self, kind: Any, name: str, depth: int) -> Any:
-        return types.SimpleNamespace(publish=self.sent.setdefault(name, []).append)
+        self.publishers.append(types.SimpleNamespace(publish=self.sent.setdefault(name, []).append))
+        return self.publishers[-1]
 
-    def create_subscription(self, kind: Any, name: str, callback: Any, profile: Any) -> None:
+    def create_subscription(self, kind: Any, name: str, callback: Any, profile: Any) -> str:
         self.heard[name] = callback
+        return name
+
+    def destroy_publisher(self, publisher: Any) -> None:
+        self.publishers.remove(publisher)
+
+    def destroy_subscription(self, name: str) -> None:
+        del self.heard[name]
+
+
+SUCCESS, FAILURE = "success", "failure"
+
+
+class Lifecycle(Topics):
+    """Stand in for a lifecycle node of rclpy: its parameters, its log and its transitions, which
+    pass the state before. `given` are parameters of a launch file."""
+
+    given: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.values: dict[str, Any] = {"use_sim_time": False}
+        self.lines: list[str] = []
+        self.state = "unconfigured"
+
+    def declare_parameter(self, name: str, value: Any) -> Any:
+        self.values[name] = self.given.get(name, value)
+        return self.get_parameter(name)
+
+    def get_parameter(self, name: str) -> Any:
+        return types.SimpleNamespace(value=self.values[name])
+
+    def get_logger(self) -> Any:
+        add = self.lines.append
+        return types.SimpleNamespace(warning=add, error=add, fatal=add)
+
+    def trigger(self, name: str, after: str) -> str:
+        result = getattr(self, f"on_{name}")(types.SimpleNamespace(label=self.state))
+        self.state = after if result == SUCCESS else self.state
+        return result
+
+    def trigger_configure(self) -> str:
+        return self.trigger("configure", "inactive")
+
+    def trigger_activate(self) -> str:
+        return self.trigger("activate", "active")
 
 
 def _message_class(kind: Any) -> type:
@@ -149,7 +200,11 @@ def node_module(parameters: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
         if isinstance(one, type) and issubclass(one, ros_messages.IdlStruct) and fields_of(one)
     }
     policy = types.SimpleNamespace(BEST_EFFORT=1, TRANSIENT_LOCAL=2)
-    fake("rclpy", __path__=[])
+    fake("rclpy", __path__=[], init=lambda: None, try_shutdown=lambda: None)
+    codes = types.SimpleNamespace(SUCCESS=SUCCESS, FAILURE=FAILURE)
+    lifecycle = {"LifecycleNode": Lifecycle, "State": object, "TransitionCallbackReturn": codes}
+    fake("rclpy.lifecycle", **lifecycle)
+    fake("rclpy.task", Future=Future)
     fake("rclpy.executors", ExternalShutdownException=KeyboardInterrupt)
     profile = types.SimpleNamespace
     fake("rclpy.qos", DurabilityPolicy=policy, QoSProfile=profile, ReliabilityPolicy=policy)
@@ -200,3 +255,119 @@ def test_an_initial_pose_is_published_once(node_module: Any):
         publisher.send_pose(number, Rigid3.identity(), np.eye(6))
     (initial,) = topics.sent["initialpose"]
     assert initial is topics.sent["topoloc/pose"][0]
+
+
+@pytest.fixture
+def localizer_node(
+    node_module: Any, room_map: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Any]]:
+    """Return a function that makes a node of the room's map with more parameters."""
+    camera = f"{CAMERA.fx},{CAMERA.fy},{CAMERA.cx},{CAMERA.cy}"
+    module, nodes = importlib.import_module("topoloc_ros.lifecycle_node"), list[Any]()
+
+    def make(**given: Any) -> Any:
+        parameters = {"map": str(room_map), "camera": camera, "odom_frame": "none", **given}
+        monkeypatch.setattr(Lifecycle, "given", parameters)
+        nodes.append(module.LocalizerNode())
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.end()
+
+
+def _show(node: Any, is_enough: Callable[[], bool], hz: float = 10.0) -> dict[int, Rigid3]:
+    """Send images of a drive through the room until a condition is true. Return their poses by
+    time."""
+    from topoloc.apps.robots import ros_messages as ros
+
+    start, shown = time.time_ns(), dict[int, Rigid3]()
+    for number in range(300):
+        t_ns, pose = start + round(number * 1e9 / hz), path_pose(1.0 + 0.02 * number)
+        pixels, shown[t_ns] = render(room(), pose, noise_seed=number)[0], pose
+        header = ros.Header(ros.Time(*divmod(t_ns, 1_000_000_000)), "camera")
+        height, width = pixels.shape
+        layout = (height, width, "mono8", 0, width, pixels.tobytes())
+        node.heard["/camera/image_raw"](ros.Image(header, *layout))
+        end = time.monotonic() + 1.0 / hz
+        while time.monotonic() < end:
+            if is_enough():
+                return shown
+            time.sleep(0.01)
+    pytest.fail(f"nothing in 30 s: {node.lines}")
+
+
+def test_the_lifecycle_node_localizes_while_it_is_active(localizer_node: Any):
+    node = localizer_node()
+    assert node.trigger_configure() == SUCCESS
+    assert (node.heard, node.publishers) == ({}, [])
+    for _ in range(2):  # it can be activated again
+        assert node.trigger_activate() == SUCCESS
+        sent = node.sent["topoloc/pose"]
+        sent.clear()
+        shown = _show(node, lambda sent=sent: len(sent) > 0)
+        stamp, position = sent[0].header.stamp, sent[0].pose.pose.position
+        truth = shown[stamp.sec * 1_000_000_000 + stamp.nanosec].translation
+        assert np.linalg.norm(truth - [position.x, position.y, position.z]) < 0.05
+        assert node.trigger("deactivate", "inactive") == SUCCESS
+        assert (node.heard, node.publishers) == ({}, [])
+    assert node.trigger("cleanup", "unconfigured") == SUCCESS
+    assert not node.failed.done()
+
+
+def test_a_node_without_its_map_stays_unconfigured(localizer_node: Any, room_map: Path):
+    node = localizer_node(map="none.topo")
+    assert node.trigger_configure() == FAILURE
+    assert (node.state, len(node.lines)) == ("unconfigured", 1)
+    assert "none.topo" in node.lines[0]
+    node.values["map"] = str(room_map)
+    assert node.trigger_configure() == SUCCESS
+
+
+def test_a_topic_that_is_none_refuses_activation(localizer_node: Any):
+    node = localizer_node(image="/camera image")
+    assert node.trigger_configure() == SUCCESS
+    assert node.trigger_activate() == FAILURE
+    assert "no topic of ROS" in node.lines[0]
+    assert (node.heard, node.publishers) == ({}, [])
+
+
+def test_an_uncalibrated_camera_ends_the_process(localizer_node: Any, monkeypatch: Any):
+    """A launch file starts it again."""
+    from topoloc.apps.robots import ros_messages as ros
+
+    zeros: Any = [0.0] * 12
+    no_distortion: Any = []
+    header, roi = ros.Header(ros.Time(1, 0), "camera"), ros.RegionOfInterest(0, 0, 0, 0, False)
+    size = (CAMERA.height, CAMERA.width)
+    matrices = (zeros[:9], zeros[:9], zeros)
+    info = ros.CameraInfo(header, *size, "plumb_bob", no_distortion, *matrices, 0, 0, roi)
+
+    def spin(node: Any, future: Future[None]) -> None:
+        assert node.state == "active"
+        node.heard["/camera/camera_info"](info)
+        _show(node, future.done)
+
+    module = importlib.import_module("topoloc_ros.lifecycle_node")
+    node = localizer_node(camera="")
+    monkeypatch.setattr(module.rclpy, "spin_until_future_complete", spin, raising=False)
+    monkeypatch.setattr(module, "LocalizerNode", lambda: node)
+    with pytest.raises(SystemExit) as ended:
+        module.main()
+    assert ended.value.code == 1
+    assert "K is zero" in node.lines[-1]
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_simulated_is_a_parameter(localizer_node: Any, simulated: bool, monkeypatch: Any):
+    module, configs = importlib.import_module("topoloc_ros.lifecycle_node"), list[Any]()
+    tracker = module.Tracker
+
+    def track(localizer: Any, config: Any) -> Any:
+        configs.append(config)
+        return tracker(localizer, config)
+
+    monkeypatch.setattr(module, "Tracker", track)
+    node = localizer_node(simulated=simulated)
+    assert (node.trigger_configure(), node.trigger_activate()) == (SUCCESS, SUCCESS)
+    assert [one.simulated for one in configs] == [simulated]

@@ -92,7 +92,6 @@ class RobotLocalizer:
         self._lock, self._is_closed = threading.RLock(), threading.Event()
         self._publisher = RobotPublisher(node, config)
         self._create_readers(node)
-        node.start()
         self._timer = threading.Thread(target=self._repeat, name="tf", daemon=True)
         self._timer.start()
 

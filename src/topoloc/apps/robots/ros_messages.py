@@ -1,5 +1,5 @@
 """Messages of ROS 2 for DDS, with the fields of their IDL (geometry_msgs, tf2_msgs, std_msgs,
-sensor_msgs, diagnostic_msgs, rosgraph_msgs, builtin_interfaces).
+sensor_msgs, diagnostic_msgs, rosgraph_msgs, builtin_interfaces, rmw_dds_common).
 
 Type names and topics are those of rmw: `geometry_msgs::msg::dds_::Pose_`, and `rt/` before the name
 of a topic. Needs `cyclonedds`, the extra `ros`.
@@ -8,7 +8,8 @@ of a topic. Needs `cyclonedds`, the extra `ros`.
 # No `from __future__ import annotations`: cyclonedds reads the types of the fields as they are.
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
@@ -183,3 +184,50 @@ class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnost
 class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::DiagnosticArray_"):
     header: Header
     status: sequence[DiagnosticStatus]
+
+
+@dataclass
+class GidSize(IdlStruct, typename="rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"):
+    """How many bytes the gids of such a message have: 24 before ROS 2 Iron, the last 8 of them
+    zero, and 16 since."""
+
+    num_bytes: uint8
+
+    @classmethod
+    def deserialize(cls, data: bytes, has_header: bool = True, use_version_2: Any = None) -> Self:
+        num_zeros, end_of_16 = 8, 20  # after the encapsulation: a gid, then the number of nodes
+        rest = bytes(data[end_of_16 : end_of_16 + num_zeros])
+        return cls(24 if rest == bytes(num_zeros) else 16)
+
+
+class GidKinds(NamedTuple):
+    """The classes of messages with gids of one size."""
+
+    gid: Any
+    node: Any
+    participant: Any
+
+
+@cache
+def gid_kinds(size: int) -> GidKinds:
+    """Return the classes of messages whose gids have `size` bytes."""
+
+    @dataclass
+    class Gid(IdlStruct, typename="rmw_dds_common::msg::dds_::Gid_"):
+        data: array[uint8, size]  # pyright: ignore[reportInvalidTypeForm]
+
+    @dataclass
+    class NodeEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::NodeEntitiesInfo_"):
+        node_namespace: str
+        node_name: str
+        reader_gid_seq: sequence[Gid]
+        writer_gid_seq: sequence[Gid]
+
+    @dataclass
+    class ParticipantEntitiesInfo(
+        IdlStruct, typename="rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
+    ):
+        gid: Gid
+        node_entities_info_seq: sequence[NodeEntitiesInfo]
+
+    return GidKinds(Gid, NodeEntitiesInfo, ParticipantEntitiesInfo)

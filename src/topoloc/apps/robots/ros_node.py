@@ -53,11 +53,13 @@ class RosNode:
             from cyclonedds import core, domain
 
             from topoloc.apps.robots import ros_messages
+            from topoloc.apps.robots.ros_announcement import Announcement
         self.messages: Any = ros_messages
         self._core, self._namespace = core, config.namespace.strip("/")
         self.domain = _find_domain(config)
         try:
-            self._participant = domain.DomainParticipant(self.domain)
+            user_data = core.Policy.Userdata(b"enclave=/;")  # ROS lists no participant without it
+            self._participant = domain.DomainParticipant(self.domain, core.Qos(user_data))
         except core.DDSException:
             raise TopolocError(
                 f"ROS domain {self.domain}: DDS has no network here; connect one, or name an"
@@ -66,7 +68,10 @@ class RosNode:
         self._callbacks: list[tuple[TopicReader, Callable[[Any], None]]] = []
         self._waitset = core.WaitSet(self._participant)
         self._is_closed = threading.Event()
+        self._announcement = Announcement(self._participant, self._namespace)
+        self._call_back(self._announcement.reader, self._announcement.hear)
         self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
+        self._thread.start()
 
     def topic_name(self, name: str) -> str:
         """Return the DDS name of a topic. A name without leading slash is in the namespace."""
@@ -81,6 +86,7 @@ class RosNode:
         qos = self._quality("reliable")
         topic = Topic(self._participant, self.topic_name(name), kind, qos=qos)
         writer = DataWriter(self._participant, topic, qos=qos)
+        self._announcement.add_writer(writer)
 
         def write(message: Any) -> None:
             with suppress(self._core.DDSException):
@@ -91,31 +97,30 @@ class RosNode:
     def create_reader(
         self, name: str, kind: Any, quality: Quality, callback: Callable[[Any], None] | None = None
     ) -> TopicReader:
-        """Return a reader. `callback` gets each message, in the thread of `start`."""
+        """Return a reader. `callback` gets each message, in a thread of the node."""
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
 
-        core, qos = self._core, self._quality(quality)
+        qos = self._quality(quality)
         topic = Topic(self._participant, self.topic_name(name), kind, qos=qos)
         reader = DataReader(self._participant, topic, qos=qos)
+        self._announcement.add_reader(reader)
         if callback is not None:
-            states = core.ViewState.Any | core.InstanceState.Alive | core.SampleState.NotRead
-            condition = core.ReadCondition(reader, states)
-            self._waitset.attach(condition)
-            self._callbacks.append((TopicReader(reader), callback))
+            self._call_back(reader, callback)
         return TopicReader(reader)
 
-    def start(self) -> None:
-        """Begin to call back."""
-        self._thread.start()
+    def _call_back(self, reader: Any, callback: Callable[[Any], None]) -> None:
+        core = self._core
+        states = core.ViewState.Any | core.InstanceState.Alive | core.SampleState.NotRead
+        self._waitset.attach(core.ReadCondition(reader, states))
+        self._callbacks.append((TopicReader(reader), callback))
 
     def close(self) -> None:
         """End the thread and leave the domain."""
         self._is_closed.set()
-        if self._thread.is_alive():
-            self._thread.join(1.0)
+        self._thread.join(1.0)
         self._callbacks.clear()
-        del self._waitset, self._participant
+        del self._announcement, self._waitset, self._participant
 
     def _spin(self) -> None:
         while not self._is_closed.is_set():
