@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import builtins
 import inspect
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -183,3 +184,36 @@ def test_an_atlas_is_made_of_map_files(lab_map: Path, tmp_path: Path):
     assert topoloc.Atlas.remove(where, ["again"]).history("lab")[0]["edit_id"] == 1
     with pytest.raises(topoloc.AtlasError, match="no tile"):
         atlas.find_problem("cellar")
+
+
+def _path_parameters() -> Iterator[tuple[str, str]]:
+    """Return the parameters of public functions and methods that take a path, and their types."""
+    for name in topoloc.__all__:
+        public = getattr(topoloc, name)
+        members = [f"{name}.{one}" for one in vars(public)] if inspect.isclass(public) else [name]
+        for path in members:
+            member = getattr(public, path.rpartition(".")[2]) if "." in path else public
+            if not inspect.isfunction(member) or path.rpartition(".")[2].startswith("_"):
+                continue
+            for parameter in inspect.signature(inspect.unwrap(member)).parameters.values():
+                if re.search(r"(^|[^\[])\bPath\b(?!\])", str(parameter.annotation)):
+                    yield f"{path}({parameter.name})", str(parameter.annotation)
+
+
+def test_paths_may_be_texts():
+    accepted = dict(_path_parameters())
+    assert len(accepted) > 20
+    assert [name for name, kind in accepted.items() if not re.search(r"\bstr\b|Input", kind)] == []
+
+
+def test_images_and_trajectories_are_read_from_texts(tmp_path: Path):
+    day = str(SHIPPED / "day")
+    image = topoloc.read_image(f"{day}/images/{sorted(os.listdir(f'{day}/images'))[0]}")
+    assert image.shape[:2] == (400, 640)
+    truth = topoloc.Trajectory.read(f"{day}/truth.tum")
+    truth.write_tum(str(tmp_path / "poses.tum"))
+    assert len(topoloc.Trajectory.read(str(tmp_path / "poses.tum"))) == len(truth)
+    posed = topoloc.with_trajectory(topoloc.open_sequence(day), f"{day}/truth.tum")
+    assert any(pose is not None for pose in posed.poses)
+    aligned = topoloc.align_to_trajectory(posed, f"{day}/truth.tum")
+    assert len(aligned) == len(posed)

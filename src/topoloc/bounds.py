@@ -11,7 +11,6 @@ Settings that earlier versions had are dropped from files that still contain the
 from __future__ import annotations
 
 import json
-import math
 import re
 import sys
 import warnings
@@ -32,43 +31,26 @@ _MAX_INT32 = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class Above:
+class Bound:
+    """Hold what a number must be, as a text and as a test. Created by the functions below."""
+
+    text: str
+    is_satisfied: Callable[[float | int], bool]
+
+
+def Above(limit: float | int) -> Bound:
     """Require a number greater than `limit`."""
-
-    limit: float | int
-
-    def is_satisfied(self, number: float | int) -> bool:
-        """Return whether a number is greater than `limit`."""
-        return number > self.limit
-
-    def __str__(self) -> str:
-        return f"above {self.limit}"
+    return Bound(f"above {limit}", lambda number: number > limit)
 
 
-@dataclass(frozen=True)
-class Between:
-    """Require a number from `least` to `most`, both included."""
-
-    least: float | int
-    most: float | int
-
-    def is_satisfied(self, number: float | int) -> bool:
-        """Return whether a number lies between the bounds or equals one of them."""
-        return self.least <= number <= self.most
-
-    def __str__(self) -> str:
-        is_open = self.most == math.inf
-        return f"at least {self.least}" if is_open else f"from {self.least} to {self.most}"
-
-
-class AtLeast(Between):
+def AtLeast(least: float | int) -> Bound:
     """Require a number of `least` or greater."""
-
-    def __init__(self, least: float | int) -> None:
-        super().__init__(least, math.inf)
+    return Bound(f"at least {least}", lambda number: number >= least)
 
 
-Bound = Above | Between
+def Between(least: float | int, most: float | int) -> Bound:
+    """Require a number from `least` to `most`, both included."""
+    return Bound(f"from {least} to {most}", lambda number: least <= number <= most)
 
 
 def check_bounds(config: Any, name: str | None = None) -> None:
@@ -195,7 +177,7 @@ def _describe_range(kind: Any) -> str:
     plain, _ = strip_annotation(kind)
     if get_origin(plain) is Literal:
         return "one of " + ", ".join(map(json.dumps, get_args(plain)))
-    return " and ".join(map(str, field_bounds(kind)))
+    return " and ".join(bound.text for bound in field_bounds(kind))
 
 
 def strip_annotation(kind: Any) -> tuple[Any, bool]:
@@ -239,7 +221,7 @@ def find_violation(value: Any, kind: Any) -> str | None:
             return f"must be a finite number, not {_shorten(number)}"
         for bound in field_bounds(kind):
             if not bound.is_satisfied(number):
-                return f"must be {bound}, not {_shorten(number)}"
+                return f"must be {bound.text}, not {_shorten(number)}"
         if plain is int and field_bounds(kind) and number > _MAX_INT32:
             return f"must be at most {_MAX_INT32}, not {_shorten(number)}"
     return None

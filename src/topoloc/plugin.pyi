@@ -1,5 +1,9 @@
 """Names for extensions, and the modules that define them."""
 
+from topoloc.apps.formats.image_lists import (
+    match_times as match_times,
+    parse_relative_path as parse_relative_path,
+)
 from topoloc.apps.formats.video import Video as Video
 from topoloc.bounds import (
     Above as Above,
@@ -29,7 +33,6 @@ from topoloc.recordings.camera_files import (
 from topoloc.recordings.format import (
     RecordingFormat as RecordingFormat,
     list_images as list_images,
-    match_times as match_times,
     natural_key as natural_key,
     read_ground_truth as read_ground_truth,
     times_from_rate as times_from_rate,
@@ -42,10 +45,7 @@ from topoloc.recordings.image_io import (
     read_depth_image as read_depth_image,
 )
 from topoloc.recordings.recording import DepthImages as DepthImages, Recording as Recording
-from topoloc.recordings.text_files import (
-    parse_relative_path as parse_relative_path,
-    read_text as read_text,
-)
+from topoloc.recordings.text_files import read_text as read_text
 from topoloc.retrieval.coarse import (
     CoarseLocalizer as CoarseLocalizer,
     CoarseModel as CoarseModel,

@@ -15,16 +15,15 @@ from uuid import uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from topoloc.apps.service import query_handler
+from topoloc.apps.service import query_handler, tile_fetcher
 from topoloc.apps.service.application import create_application
 from topoloc.apps.service.config import ServiceConfig
+from topoloc.apps.service.tile_fetcher import TileFetcher, TilePending
 from topoloc.apps.stores.object_store import ObjectStore
-from topoloc.atlas import tile_fetcher
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.store import store_at
-from topoloc.atlas.tile_fetcher import TileFetcher, TilePending
 from topoloc.errors import AtlasError, MapError, ObjectStoreError
 from topoloc.localization.localizer import Localizer
 

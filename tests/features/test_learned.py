@@ -202,7 +202,7 @@ def test_the_same_on_any_number_of_threads(network: Path):
 
 
 def test_cells_are_means_over_the_picture_and_nothing_beyond_it(network: Path):
-    learned.close_networks()
+    learned._session_for_size.cache_clear()
     write_network(network, outputs=("scores", "descriptors", "places"))
     picture = np.random.default_rng(4).integers(
         0, 256, (96, 144), dtype=np.uint8
@@ -236,7 +236,7 @@ def test_a_damaged_missing_or_other_network_is_one_line(network: Path):
     write_network(network.with_name("edgepoint2-t32.onnx"), "edgepoint2-s64")
     assert "holds edgepoint2-s64, not edgepoint2-t32" in _refused("edgepoint2-t32")
     assert "`topoloc weights get edgepoint2-e64`" in _refused("edgepoint2-e64")
-    learned.close_networks()
+    learned._session_for_size.cache_clear()
     network.write_bytes(network.read_bytes()[:500])
     assert "cut short, damaged, or not ONNX" in _refused()
 

@@ -11,7 +11,7 @@ import pytest
 
 from traced import users_environment
 
-_STATE = "from topoloc.features.onnx_runtime import find_telemetry, load_onnxruntime\n"
+_STATE = "from topoloc.features.network_files import find_telemetry, load_onnxruntime\n"
 _LOAD = f"{_STATE}load_onnxruntime()\nload_onnxruntime()\nprint(find_telemetry())\n"
 _FOLDER = Path(".cache") / "Microsoft"
 

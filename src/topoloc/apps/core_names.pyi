@@ -1,7 +1,7 @@
 """Names for applications alone, and the modules that define them."""
 
 from topoloc.atlas.manifest import check_tile_id as check_tile_id
-from topoloc.atlas.tile_fetcher import TilePending as TilePending
+from topoloc.atlas.map_cache import RETRY_AFTER_S as RETRY_AFTER_S
 from topoloc.bounds import (
     describe_ranges as describe_ranges,
     parse_tables as parse_tables,
@@ -11,8 +11,10 @@ from topoloc.compiled import kernel_caches as kernel_caches
 from topoloc.evaluation.metrics import format_length as format_length
 from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
 from topoloc.features.feature_types import find_available_types as find_available_types
-from topoloc.features.network_files import NetworkInfo as NetworkInfo
-from topoloc.features.onnx_runtime import find_telemetry as find_telemetry
+from topoloc.features.network_files import (
+    NetworkInfo as NetworkInfo,
+    find_telemetry as find_telemetry,
+)
 from topoloc.geometry.alignment import nearest_rotation as nearest_rotation
 from topoloc.geometry.transform_consensus import find_least_median as find_least_median
 from topoloc.json_data import OneLine as OneLine, Positive as Positive
@@ -32,6 +34,10 @@ from topoloc.mapping.certificate import (
     Quarter as Quarter,
 )
 from topoloc.mapping.edit import edit_map as edit_map
+from topoloc.mapping.junctions import (
+    WalkGraph as WalkGraph,
+    describe_junctions as describe_junctions,
+)
 from topoloc.mapping.nodes import NodePoses as NodePoses, node_distances as node_distances
 from topoloc.mapping.storage.entries import today as today
 from topoloc.node_ids import NodeId as NodeId, Row as Row
@@ -54,6 +60,7 @@ from topoloc.recordings.camera_files import (
     make_rig as make_rig,
     read_yaml as read_yaml,
     require_numbers as require_numbers,
+    yaml_image_size as yaml_image_size,
     yaml_numbers as yaml_numbers,
     yaml_word as yaml_word,
 )
@@ -75,13 +82,12 @@ from topoloc.recordings.recording import (
     keep_frames as keep_frames,
     scale_poses as scale_poses,
 )
-from topoloc.recordings.ros_calibration import RosCalibration as RosCalibration
 from topoloc.recordings.stored_images import encode_jpeg as encode_jpeg
 from topoloc.recordings.text_files import (
     parse_numbers as parse_numbers,
     parse_times as parse_times,
-    read_file_list as read_file_list,
     read_rows as read_rows,
+    with_decimal_points as with_decimal_points,
 )
 from topoloc.recordings.trajectory import (
     has_answers as has_answers,

@@ -87,7 +87,12 @@ class Atlas(OneLine):
 
     @staticmethod
     def add_map(
-        where: str, tile_id: str, path: Path, world: str, recipe: str, replaces: bool = False
+        where: str,
+        tile_id: str,
+        path: str | Path,
+        world: str,
+        recipe: str,
+        replaces: bool = False,
     ) -> Tile:
         """Add a map file as a tile, and create the atlas if there is none. `recipe` is the digest
         of the map's inputs. A tile of the same id is replaced (`replaces`), or is an error, unless
@@ -96,7 +101,7 @@ class Atlas(OneLine):
         Raises AtlasError if the atlas has a tile of the same id or cannot be written, MapError if
         the map is damaged or empty.
         """
-        new = NewTile(tile_id, path, world, recipe)
+        new = NewTile(tile_id, Path(path), world, recipe)
         return editing.add_tiles(where, [new], replaces, creates=True).by_id[tile_id]
 
     @staticmethod

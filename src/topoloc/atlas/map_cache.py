@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,13 +23,14 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.place import open_place
-from topoloc.atlas.store import file_stamp
-from topoloc.atlas.tile_fetcher import TileFetcher, WatchedAtlas
-from topoloc.errors import MapError, MapNotFoundError
+from topoloc.atlas.store import file_stamp, store_at
+from topoloc.errors import AtlasError, MapError, MapNotFoundError
 from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.mapping.topomap import TopoMetricMap
 
 SUFFIX = ".topo"
+RETRY_AFTER_S = 5.0
+"""Seconds before a tile that could not be fetched or opened is tried again."""
 TilePath = Callable[[Atlas, Tile], Path]
 """A function that returns the local map file of a tile. It raises AtlasError, or another exception
 if the file is not available yet."""
@@ -85,6 +86,62 @@ class _MapSource:
     tile: tuple[Atlas, Tile] | None = field(default=None, compare=False)
 
 
+class WatchedAtlas:
+    """Hold the current version of an atlas, for long-running readers. It is opened again when its
+    manifest changes.
+
+    In a folder each access checks the manifest file. An object store may take a minute to respond.
+    There `look` is called now and then in the background, and readers continue with the last
+    version, even while the store does not respond.
+
+    Raises:
+        AtlasError: there is no atlas, or it is damaged.
+        ObjectStoreError: its store does not respond.
+        MissingExtraError: the extra for object stores is not installed.
+    """
+
+    def __init__(self, where: str) -> None:
+        self.where, self.is_remote = where, "://" in where
+        self._store, self._lock = store_at(where), threading.Lock()
+        self._version, self._atlas = self._check_version(), self._open()
+
+    def now(self) -> Atlas:
+        """Return the current atlas of a folder, or the last seen version of an object store.
+
+        Raises:
+            AtlasError: the atlas cannot be read.
+        """
+        if not self.is_remote:
+            with self._lock:
+                self.look()
+        return self._atlas
+
+    def look(self) -> bool:
+        """Open the atlas again if its manifest changed, and return whether it did. Only one thread
+        may call it at a time.
+
+        Raises AtlasError if the atlas is gone or damaged, ObjectStoreError if the store does not
+        respond.
+        """
+        version = self._check_version()
+        if version == self._version:
+            return False
+        self._version, self._atlas = version, self._open()
+        return True
+
+    def _check_version(self) -> Hashable:
+        version = self._store.version()
+        if version is None:
+            raise AtlasError(f"{self.where} is no atlas, or not any more: it has no manifest")
+        return version
+
+    def _open(self) -> Atlas:
+        atlas = Atlas.open(self.where)
+        if self.is_remote:
+            _ = atlas.index  # fetches the index files now, not during a query
+        return atlas
+
+
 class MapCache(Generic[M]):
     """Cache the maps of files, folders and atlases. Atlases may be in object stores.
 
@@ -124,15 +181,13 @@ class MapCache(Generic[M]):
         sources: Sequence[str],
         open_map: Callable[[TopoMetricMap], M],
         memory_mb: int,
-        fetch_s: float | None = None,
+        tile_path: TilePath = Atlas.map_path,
     ) -> MapCache[M]:
         """Create a cache that uses half of the memory (megabytes) for nodes, of all maps of this
-        process, and half for the rest of the open maps. Queries wait `fetch_s` seconds for a tile
-        of an object store, see `TileFetcher`; None is no limit. Raises as the class does."""
+        process, and half for the rest of the open maps. Raises as the class does."""
         budget = memory_mb * 500_000
         set_node_cache_size(budget)
-        path = Atlas.map_path if fetch_s is None else TileFetcher(fetch_s).path
-        return MapCache(sources, open_map, budget, path)
+        return MapCache(sources, open_map, budget, tile_path)
 
     def names(self) -> list[str]:
         """Return the names of all current maps. No object store is queried.
@@ -174,7 +229,7 @@ class MapCache(Generic[M]):
         return [entry.opened for entry in self._entries.values() if entry.opened is not None]
 
     @contextmanager
-    def use_map(self, name: str, path: Path | None = None) -> Iterator[CachedMap[M]]:
+    def use_map(self, name: str, path: str | Path | None = None) -> Iterator[CachedMap[M]]:
         """Open the map of this name for the context, from the file `path` if it is given.
 
         Raises:
@@ -187,9 +242,9 @@ class MapCache(Generic[M]):
         finally:
             self.release_map(opened)
 
-    def acquire_map(self, name: str, path: Path | None = None) -> CachedMap[M]:
+    def acquire_map(self, name: str, path: str | Path | None = None) -> CachedMap[M]:
         """Open a map as `use_map` does. It stays open until `release_map`."""
-        path = path or self._path_of(name)
+        path = Path(path or self._path_of(name))
         with self._lock:
             entry = self._entries.setdefault(name, _CacheEntry())
             self._entries.move_to_end(name)

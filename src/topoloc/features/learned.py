@@ -136,11 +136,6 @@ def _session_for_size(
     return session
 
 
-def close_networks() -> None:
-    """Close all open networks. They are opened again when needed."""
-    _session_for_size.cache_clear()
-
-
 @kernel()
 def find_maxima(scores, height, width, border, min_score):
     """Return the local maxima of the scores as pixels (x, y), row by row, and their scores.

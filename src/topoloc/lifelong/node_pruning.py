@@ -1,5 +1,4 @@
-"""Choose the nodes and the landmarks that a smaller map keeps, and quantize descriptors in larger
-steps.
+"""Choose the nodes and the landmarks that a smaller map keeps.
 
 A node covers its own mapping images. Another node supports it by the number of landmarks recognised
 in it. Each node counts only its best supporter among the nodes that stay. This is the facility

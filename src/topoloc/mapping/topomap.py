@@ -149,7 +149,8 @@ class TopoMetricMap:
 
     def describe(self, path: str | Path) -> dict[str, Any]:
         """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,
-        sessions, edits, configuration. Raises EmptyMapError: the map has no node."""
+        junctions, sessions, edits, configuration. Raises EmptyMapError: the map has no node."""
+        from topoloc.mapping.junctions import describe_junctions
         from topoloc.mapping.storage.map_reading import list_coarse_models
 
         path = Path(path)
@@ -170,6 +171,7 @@ class TopoMetricMap:
             "num_side_nodes": len(self.sides.summaries) if self.sides else 0,
             "num_place_images": len(self.place_images),
             "length_m": round(self.length_m, 3),
+            "junctions": describe_junctions(self),
             "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
             "recordings": sorted({s.recording for s in self.summaries}),
             "sessions": [

@@ -26,6 +26,7 @@ from topoloc.recordings.camera_files import (
     read_calibration_yaml,
     read_camera_json,
     read_yaml,
+    yaml_image_size,
 )
 from topoloc.recordings.format import load_reader
 from topoloc.recordings.frame import StereoSequence
@@ -37,6 +38,7 @@ from topoloc.recordings.text_files import read_text
 READERS = {
     "slam_settings": "topoloc.apps.formats.calibrations.slam_settings:read_slam_settings",
     "slam_files": "topoloc.apps.formats.calibrations.slam_settings:camera_files",
+    "ros_pair": "topoloc.apps.formats.calibrations.ros_calibration:read_ros_pair",
     "other": "topoloc.apps.formats.calibrations.other_cameras:read_other_camera",
 }
 
@@ -78,8 +80,13 @@ def parse_calibration(text: str | Path, allow_files: bool = True) -> Calibration
 
 def _read_yaml_calibration(path: Path, width: int, height: int) -> CameraCalibration:
     text = read_yaml(path)
+    size = float(width), float(height)
     if has_slam_settings(text):
-        return load_reader(READERS["slam_settings"])(path, text, (float(width), float(height)))
+        return load_reader(READERS["slam_settings"])(path, text, size)
+    if right_file := find_right_file(path):
+        size = yaml_image_size(text) or size
+        if calibration := load_reader(READERS["ros_pair"])(path, right_file, size):
+            return calibration
     return read_calibration_yaml(path, width, height)
 
 

@@ -1,10 +1,10 @@
-"""Read calibrations of a camera or a stereo rig: camera.json, and YAML of OpenCV FileStorage,
-Kalibr camchain and ROS.
+"""Read calibrations of a camera or a stereo rig: camera.json, and YAML of OpenCV FileStorage and
+Kalibr camchain. A pair of files of ROS, `left.yaml` and `right.yaml`, is found here.
 
 OpenCV: `M1 D1 M2 D2 R T` as in its stereo sample, or the longer names of other programs. `R` and
 `T` may be in an extrinsics.yml beside it. They transform points from the left camera to the right
-one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`, or both with `T_cam_imu` or `T_imu_cam`. ROS: a file
-for each camera, `left.yaml` and `right.yaml`. Lengths are in metres.
+one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`, or both with `T_cam_imu` or `T_imu_cam`. Lengths are
+in metres.
 
 The files come with or without OpenCV's header and in several styles of YAML. So only words and
 numbers after the needed keys are read. Tags and aliases are ignored.
@@ -26,7 +26,6 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Positive, decode_json
-from topoloc.recordings.ros_calibration import RosCalibration
 from topoloc.recordings.text_files import read_text
 
 FILE_NAME = "camera.json"
@@ -94,7 +93,7 @@ _DISTORTIONS = {
     "none": ("PINHOLE", 0),
 }
 # Kalibr's camera models that are not read
-_KALIBR_MODELS = {"ds": "double sphere", "eucm": "extended unified", "omni": "Mei's unified"}
+_KALIBR_MODELS = {"ds": "double sphere", "omni": "Mei's unified"}
 _FISHEYE_WORDS = ("equidistant", "fisheye", "KANNALA_BRANDT")
 # names of the camera matrix and the distortion of the left, the right, and a single camera
 _LEFT_KEYS = tuple(
@@ -184,11 +183,7 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibrat
     text = read_yaml(path)
     if _is_kalibr(text):
         return _read_kalibr(path, text)
-    size = _image_size(text) or (float(width), float(height))
-    if right_file := find_right_file(path):
-        left, right = (_ros_calibration(file, size) for file in (path, right_file))
-        if rig := left.rig(right, is_rectified=False):
-            return CameraCalibration(rig.left, rig)
+    size = yaml_image_size(text) or (float(width), float(height))
     if not yaml_numbers(text, *_LEFT_KEYS[0]):
         return CameraCalibration(_opencv_camera(path, text, _MONO_KEYS, size))
     left, right = (_opencv_camera(path, text, names, size) for names in (_LEFT_KEYS, _RIGHT_KEYS))
@@ -209,31 +204,21 @@ def find_right_file(path: Path) -> Path | None:
     return right if has_projections and all(has_projections) else None
 
 
-def _ros_calibration(path: Path, size: tuple[float, float]) -> RosCalibration:
-    text = read_yaml(path)
-    width, height = (int(min(length, 1e9)) for length in _image_size(text) or size)
-    numbers = {
-        key: np.array(require_numbers(path, text, count, f"{key}_matrix"))
-        for key, count in (("camera", 9), ("rectification", 9), ("projection", 12))
-    }
-    return RosCalibration(
-        name=str(path),
-        frame="",
-        width=width,
-        height=height,
-        model=yaml_word(text, "distortion_model", ""),
-        distortion=np.array(yaml_numbers(text, "distortion_coefficients")),
-        matrix=numbers["camera"].reshape(3, 3),
-        rotation=numbers["rectification"].reshape(3, 3),
-        projection=numbers["projection"].reshape(3, 4),
-    )
-
-
 def kalibr_camera(path: Path, section: str) -> Camera:
     """Read the camera of a sensor.yaml, or of a section of a camchain. Raises CalibrationError."""
     distortion = yaml_word(section, "distortion_model", "none")
     kind, known = yaml_word(section, "camera_model", "pinhole"), ", ".join(_DISTORTIONS)
     remedy = "calibrate with Kalibr's --models pinhole-equi, or pinhole-radtan for a narrow lens"
+    if kind == "eucm":
+        from topoloc.geometry.fitted_models import fit_known_model  # loads an optimizer
+
+        alpha, beta, *params = require_numbers(path, section, 6, "intrinsics")
+        width, height = require_numbers(path, section, 2, "resolution")
+        make_camera(path, "PINHOLE", (width, height), params)  # refuses sizes that are none
+        with CalibrationError.at(path):
+            numbers = *params, alpha, beta
+            model, fitted = fit_known_model("EUCM", int(width), int(height), numbers)
+        return make_camera(path, model, (width, height), list(fitted))
     if kind != "pinhole":
         name = f" ({_KALIBR_MODELS[kind]})" if kind in _KALIBR_MODELS else ""
         raise CalibrationError(f"{path}: camera_model {kind}{name} is not known here; {remedy}")
@@ -308,7 +293,7 @@ def make_camera(path: Path, model: str, size: tuple[float, float], params: list[
         return Camera(model, int(size[0]), int(size[1]), tuple(params))
 
 
-def _image_size(text: str) -> tuple[float, float] | None:
+def yaml_image_size(text: str) -> tuple[float, float] | None:
     """Return width and height, or None if the file contains no size."""
     pair = yaml_numbers(text, "image_size", "imageSize", "size", "resolution")
     if len(pair) >= 2:

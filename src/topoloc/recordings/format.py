@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 from warnings import warn
 
-import numpy as np
-
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
@@ -129,36 +127,6 @@ def _renumbered(path: Path, number: str) -> Path:
     """Return the image with another last number."""
     *_, last = re.finditer(r"\d+", path.stem)
     return path.with_name(path.name[: last.start()] + number + path.name[last.end() :])
-
-
-def match_times(
-    t_ns: Sequence[int],
-    others: Sequence[int],
-    max_delay_ms: int,
-    where: str,
-    names: tuple[str, str],
-) -> tuple[list[tuple[int, int]], tuple[str, ...]]:
-    """Return the row of each time that has another one (both increasing, nanoseconds) within
-    `max_delay_ms`, with the row of the nearest. The second value is a note on the times without.
-
-    Raises:
-        RecordingError: no time has one. Begins with `where`. `names` are those of the two lists.
-    """
-    times, partners = np.array(t_ns), np.array(others)
-    after = np.clip(np.searchsorted(partners, times), 1, max(len(partners) - 1, 1))
-    before, after = after - 1, np.minimum(after, len(partners) - 1)
-    nearest = np.where(times - partners[before] <= partners[after] - times, before, after)
-    delays = np.abs(times - partners[nearest])
-    kept = np.flatnonzero(delays <= max_delay_ms * 1_000_000)
-    num_without = len(times) - len(kept)
-    text = (
-        f"{where}: {num_without} of {len(times)} pictures of {names[0]} have none of {names[1]}"
-        f" ({len(partners)}) within {max_delay_ms} ms"
-    )
-    if not len(kept):
-        raise RecordingError(f"{text}; the nearest is {delays.min() / 1e6:.1f} ms away")
-    notes = (f"{text} and are left out",) if num_without else ()
-    return list(zip(kept.tolist(), nearest[kept].tolist(), strict=True)), notes
 
 
 def times_from_rate(num_frames: int, rate_hz: int = 10) -> list[int]:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
-from pathlib import Path, PurePath, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,7 +22,6 @@ _MAX_DIGITS = 25
 # Up to ten digits are seconds, not nanoseconds. These fit into 64 bits as nanoseconds.
 _PLAIN_SECONDS = re.compile(r"[0-8]?[0-9]{1,9}(?:\.[0-9]{1,9})?")
 _DECIMAL_COMMA = re.compile(r"(?<![^\s;])([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)(?=[\s;]|$)")
-_TIME_AND_NAME = re.compile(r"([^\s,;]+)[\s,;]+(.+?\.[A-Za-z]\w{2,3}(?=[\s,;]|$)|[^\s,;]+)")
 
 Rows = Sequence[tuple[int, list[str]]]
 """Line numbers and columns."""
@@ -62,12 +61,12 @@ def _read_lines(path: Path, error: type[TopolocError]) -> list[str]:
     """Return the lines without comments, with spaces instead of commas and semicolons."""
     text = read_text(path, error)
     if "," in text or ";" in text:
-        lines = map(_with_decimal_points, text.splitlines())
+        lines = map(with_decimal_points, text.splitlines())
         text = "\n".join(lines).replace(",", " ").replace(";", " ")
     return [line.partition("#")[0] for line in text.splitlines()]
 
 
-def _with_decimal_points(line: str) -> str:
+def with_decimal_points(line: str) -> str:
     """Replace the decimal commas of a line whose columns are separated by spaces or semicolons."""
     has_columns = len(line.split(None, 1)) > 1 or ";" in line
     return _DECIMAL_COMMA.sub(r"\1.\2", line) if has_columns else line
@@ -156,38 +155,6 @@ def _find_digits(last: float, step: float, max_step_s: float = 10.0) -> int:
     if last <= max_seconds and step <= max_step_s:
         return 9
     return 6 if 0.0 < step <= 2e3 else 3 if 0.0 < step <= 2e6 else 0
-
-
-def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], list[str]]:
-    """Read the times in nanoseconds and the file names of a list of images. The files are below the
-    list's folder. A name ends with its suffix and may contain spaces and commas.
-
-    Raises:
-        error: as `read_rows` and `parse_times`, a line has no file name, or a name leaves the
-            folder.
-    """
-    rows: list[tuple[int, list[str]]] = []
-    for number, text in enumerate(read_text(path, error).splitlines(), start=1):
-        line = _with_decimal_points(text.strip())
-        if line and not line.startswith("#"):
-            found = _TIME_AND_NAME.match(line)
-            if found is None:
-                raise error(f"{path}, line {number}: not a time and a file name")
-            name = parse_relative_path(found[2], f"{path}, line {number}", error)
-            rows.append((number, [found[1], name]))
-    if not rows:
-        raise error(f"{path}: nothing in this file")
-    return parse_times(rows, path, error), [name for _, (_, name) in rows]
-
-
-def parse_relative_path(name: str, where: str, error: type[TopolocError]) -> str:
-    """Return a file name that stays inside its folder, with slashes instead of backslashes. Raises
-    `error` otherwise, which begins with `where`."""
-    path = PurePath(name.replace("\\", "/"))
-    leaves = path.is_absolute() or ".." in path.parts or PureWindowsPath(name).drive
-    if not path.parts or leaves or "\0" in name:
-        raise error(f"{where}: {name[:80]!r} is no picture below this folder")
-    return path.as_posix()
 
 
 def parse_numbers(path: Path, rows: Rows, columns: Sequence[int]) -> Float[np.ndarray, "n c"]:

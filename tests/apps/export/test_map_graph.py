@@ -13,6 +13,7 @@ import numpy as np
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.apps.cli.maps.info import build_graph
+from topoloc.apps.core_names import describe_junctions
 
 NS = {"g": "http://graphml.graphdrawing.org/xmlns"}
 
@@ -36,15 +37,8 @@ def test_the_graph_is_that_of_the_map(room_map: Path):
                 < 1e-12
             )
             assert facts["times"] >= 1
-    degrees = {
-        node: len(
-            {b for a, b in graph.edges if a == node} | {a for a, b in graph.edges if b == node}
-        )
-        for node in graph.nodes
-    }
-    assert {node: facts["is_junction"] for node, facts in graph.nodes.items()} == {
-        node: n > 2 for node, n in degrees.items()
-    }
+        junctions = {one["node"] for one in describe_junctions(topomap)}
+    assert {node for node, facts in graph.nodes.items() if facts["is_junction"]} == junctions
 
 
 def test_graphml_declares_what_it_holds(room_map: Path, tmp_path: Path):

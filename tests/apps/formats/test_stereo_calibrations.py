@@ -16,6 +16,7 @@ from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.recordings.camera_files import read_calibration_yaml
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 
@@ -355,3 +356,17 @@ def test_a_distorted_pair_is_rectified_as_its_calibration():
         rectified.rig.left.fx * rig.baseline / in_rectified[:, 2],
         atol=1e-9,
     )
+
+
+def test_a_lens_of_kalibrs_unified_model(tmp_path: Path):
+    path = tmp_path / "camchain.yaml"
+    path.write_text(
+        "cam0:\n  camera_model: eucm\n  distortion_model: none\n"
+        "  intrinsics: [0.6, 1.1, 300.0, 310.0, 321.0, 241.0]\n  resolution: [640, 480]\n"
+    )
+    camera = read_calibration_yaml(path, 640, 480).camera
+    points = np.array([[0.3, -0.2, 1.0], [-0.6, 0.4, 1.0], [0.0, 0.0, 2.0]])
+    x, y, z = points.T
+    depth = 0.6 * np.sqrt(1.1 * (x * x + y * y) + z * z) + 0.4 * z
+    pixels = np.column_stack([300.0 * x / depth + 321.0, 310.0 * y / depth + 241.0])
+    np.testing.assert_allclose(camera.img_from_cam(points), pixels, atol=0.1)

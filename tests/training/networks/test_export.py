@@ -12,8 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from topoloc.features.network_files import NETWORKS, NetworkInfo
-from topoloc.features.onnx_runtime import load_onnxruntime
+from topoloc.features.network_files import NETWORKS, NetworkInfo, load_onnxruntime
 from topoloc_training.net.network import TopolocNet
 from topoloc_training.networks.edgepoint2 import EdgePoint2
 from topoloc_training.networks.export import build_network, convert, export

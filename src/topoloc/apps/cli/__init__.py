@@ -40,6 +40,7 @@ _GROUPS = {
         "maps.certify": "measure how often answers are wrong, with a bound at 95 % confidence",
         "queries.explain": "explain the result of an image and give advice",
         "maps.info": "print the contents of a map file",
+        "maps.route": "print the shortest way along the nodes from one place to another",
         "maps.view": "show a map and results in 3-D in the browser",
     },
     "care for maps": {

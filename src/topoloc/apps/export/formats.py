@@ -101,9 +101,9 @@ def to_ply(scene: Scene) -> bytes:
 
 
 def to_geojson(scene: Scene) -> bytes:
-    """Return RFC 7946: a point for each view, a line for each session. Coordinates are longitude,
-    latitude and height above the ellipsoid. Raises GeoreferenceError: the scene is not
-    georeferenced."""
+    """Return RFC 7946: a point for each view and junction, a line for each session. Coordinates
+    are longitude, latitude and height above the ellipsoid. Raises GeoreferenceError: the scene is
+    not georeferenced."""
     points, lines = [], []
     for session_id, group in groupby(scene.views, lambda view: view.session_id):
         line = []
@@ -119,6 +119,10 @@ def to_geojson(scene: Scene) -> bytes:
         raise GeoreferenceError(
             "GeoJSON needs a georeferenced map; `topoloc georeference MAP` sets the position"
         )
+    if scene.georeference is not None:
+        for one in scene.junctions:
+            at = scene.georeference.geopoint(np.array(one["position"]))
+            points.append(geojson_feature("Point", coordinates(at), {"junction": True, **one}))
     collection = {"type": "FeatureCollection", "features": [*lines, *points]}
     return (json.dumps(collection, indent=1) + "\n").encode()
 

@@ -29,14 +29,14 @@ from topoloc.apps.core_names import (
     find_calibration,
     first_image_size,
     kalibr_camera,
-    read_file_list,
     read_rows,
     read_yaml,
     replace_cameras,
     require_numbers,
     timed_trajectory,
 )
-from topoloc.plugin import Recording, RecordingFormat, match_times
+from topoloc.apps.formats.image_lists import match_times, read_file_list
+from topoloc.plugin import Recording, RecordingFormat
 
 EXPECTED_FILES = "mav0/ with cam0/data.csv, or cam0/data.csv"
 MAX_TRUTH_GAP, MAX_PAIR_DELAY_MS = 0.05, 1

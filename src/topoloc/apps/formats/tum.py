@@ -11,13 +11,13 @@ import re
 from pathlib import Path
 
 from topoloc import CalibrationError, Camera, RecordingError, Rigid3
-from topoloc.apps.core_names import CalibrationForSize, first_image_size, read_file_list
+from topoloc.apps.core_names import CalibrationForSize, first_image_size
+from topoloc.apps.formats.image_lists import match_times, read_file_list
 from topoloc.plugin import (
     CameraCalibration,
     DepthImages,
     Recording,
     RecordingFormat,
-    match_times,
     read_camera_json,
     read_ground_truth,
 )

@@ -27,7 +27,6 @@ from topoloc import (
     Tracker,
     TrackerConfig,
 )
-from topoloc.apps.core_names import TilePending
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import while_connected
 from topoloc.apps.service.logs import Metrics, log
@@ -36,6 +35,7 @@ from topoloc.apps.service.protocols.discovery_messages import Announced
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError, to_request_error
+from topoloc.apps.service.tile_fetcher import TilePending
 
 _MAINTENANCE_PERIOD_S = 5.0
 R = TypeVar("R")

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from topoloc import Camera, Rigid3, TopoMetricMap, read_image
+from topoloc.apps import core_names
 from topoloc.apps.core_names import encode_jpeg
 from topoloc.apps.viewer.map_scene import sample_node_colours, unique_image_names
 from topoloc.plugin import EncodedImage
@@ -74,6 +75,7 @@ def create_document(
             "rgb": to_base64(shown.rgb),
         },
         "nodes": _nodes_to_json(topomap, shown.cameras, images),
+        "junctions": core_names.describe_junctions(topomap),
         "paths": [*_mapped_paths(topomap), *result_paths(results)],
         "results": [results_to_json(one) for one in results if one.answers],
     }

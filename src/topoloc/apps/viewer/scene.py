@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -58,10 +59,11 @@ class Points:
 @dataclass(frozen=True, eq=False)
 class Scene:
     """`views` are in the order of recording. `trajectory` holds all known poses, with or without an
-    image or a time."""
+    image or a time. `junctions` are those of a map as JSON, none for results and parts of maps."""
 
     name: str
     views: Sequence[View]
     points: Points
     trajectory: Sequence[Rigid3]
     georeference: Georeference | None = None
+    junctions: Sequence[Mapping[str, Any]] = ()

@@ -41,6 +41,7 @@ def create_world_scene(
     ObjectStoreError: the store does not answer.
     """
     views, trajectory, points = list[View](), list[Rigid3](), list[Points]()
+    junctions = list[Mapping[str, Any]]()
     first_session = first_row = 0
     for placed, topomap in world.open_tiles(atlas, warn):
         scene = create_map_scene(topomap, name, None, with_points, progress)
@@ -59,13 +60,23 @@ def create_world_scene(
             for view in scene.views
         ]
         trajectory += [placed.world_from_map @ pose for pose in scene.trajectory]
+        junctions += [
+            _place_junction(one, placed.tile.tile_id, placed.world_from_map)
+            for one in scene.junctions
+        ]
         points.append(replace(scene.points, world=placed.world_from_map.apply(scene.points.world)))
         first_row += len(scene.points.world)
     if world.georeference is not None:
         views = [
             replace(view, geopose=world.georeference.geopose(view.world_from_cam)) for view in views
         ]
-    return Scene(name, views, _merge_points(points), trajectory, world.georeference)
+    merged = _merge_points(points)
+    return Scene(name, views, merged, trajectory, world.georeference, junctions)
+
+
+def _place_junction(one: Mapping[str, Any], tile_id: str, world_from_map: Rigid3) -> Document:
+    position = world_from_map.apply(np.array(one["position"])).round(4).tolist()
+    return dict(one) | {"tile": tile_id, "position": position}
 
 
 def _merge_points(points: Sequence[Points]) -> Points:
@@ -189,6 +200,9 @@ def _transform_document(document: Document, world_from_map: Rigid3, first_sessio
             }
             for node in document["nodes"]
         ],
+        "junctions": [
+            _place_junction(one, tile_id, world_from_map) for one in document["junctions"]
+        ],
         "paths": [transform_path(path) for path in document["paths"]],
     }
 
@@ -215,6 +229,7 @@ def _merge_documents(parts: Sequence[Document], name: str) -> Document:
             for key in ("world", "rgb")
         },
         "nodes": [node for part in parts for node in part["nodes"]],
+        "junctions": [one for part in parts for one in part["junctions"]],
         "paths": [path for part in parts for path in part["paths"]],
         "results": [],
     }

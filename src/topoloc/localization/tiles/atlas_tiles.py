@@ -17,8 +17,7 @@ from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.joint_worlds import sigmas_at
 from topoloc.atlas.location_prior import LocationPrior, tiles_in_reach
 from topoloc.atlas.manifest import Tile
-from topoloc.atlas.map_cache import MapCache
-from topoloc.atlas.tile_fetcher import RETRY_AFTER_S
+from topoloc.atlas.map_cache import RETRY_AFTER_S, MapCache
 from topoloc.errors import AtlasError, MapError
 from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig, find_available_types
 from topoloc.geometry.camera import Camera, UncalibratedCamera

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int8, UInt8
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import OneLine
+from topoloc.json_data import NonNegative, OneLine
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.node_ids import LazySequence, NodeId
 from topoloc.retrieval.coarse import CoarseModel, Image
@@ -288,7 +288,7 @@ class CorrelatedErrors:
     result holds only for these.
     """
 
-    rho: float
+    rho: NonNegative
     digest: str
 
 

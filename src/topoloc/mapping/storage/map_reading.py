@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -102,7 +101,7 @@ def _read_fields(file: MapFile) -> dict[str, Any]:
         "edits": [
             Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")
         ],
-        "next_ids": parse_settings(NextIds, _decode_fact(facts, "next_ids", dict, {}), "next_ids"),
+        "next_ids": _decode_fact(facts, "next_ids", NextIds, NextIds()),
         "map_id": map_id,
         "georeference": None if of_earth is None else Georeference.from_json(of_earth),
         "certificate": _decode_fact(facts, "certificate", Certificate, None),
@@ -150,15 +149,10 @@ def _read_layer(file: MapFile, kind: str, first: str):
     """Return the layer of a feature type, given the map's first type, whose numbers of points are
     those of the summaries."""
     suffix = layer_suffix(kind, first)
-    key, errors = f"shared_errors{suffix}", None
-    if key in file.facts:
-        errors = parse_settings(CorrelatedErrors, _decode_fact(file.facts, key, dict, {}), key)
-        if not 0.0 <= errors.rho < math.inf:
-            raise CorruptDataError("shared errors that are no share")
     return Layer(
         _lazy_rows(file, "nodes", _read_node, kind, "", kind == first),
         _lazy_entries(file, "coarse_models", model_from_row, suffix),
-        errors,
+        _decode_fact(file.facts, f"shared_errors{suffix}", CorrelatedErrors, None),
     )
 
 

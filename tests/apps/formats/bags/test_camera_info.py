@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from topoloc.apps.formats.bags.bag_images import camera_info
+from topoloc.apps.formats.calibrations.ros_calibration import RosCalibration
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import exp_so3
-from topoloc.recordings.ros_calibration import RosCalibration
 
 K = np.array([[500.0, 0, 320], [0, 505, 240], [0, 0, 1]])
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8, UInt8
 
-from topoloc.features.onnx_runtime import load_onnxruntime
+from topoloc.features.network_files import load_onnxruntime
 from topoloc.recordings.format import list_images
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import read_image

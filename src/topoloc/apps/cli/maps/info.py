@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +23,7 @@ from topoloc import (
     check_map,
     open_place,
 )
+from topoloc.apps import core_names
 from topoloc.apps.cli.maps.atlas import show_atlas
 from topoloc.apps.cli.output import (
     File,
@@ -35,11 +36,11 @@ from topoloc.apps.cli.output import (
     print_quarters,
     write_json,
 )
-from topoloc.apps.export.formats import coordinates, geojson_feature
 from topoloc.apps.quality.certificate_texts import describe_group
 from topoloc.plugin import write_bytes
 
 MAX_PROBLEMS = 20
+MAX_JUNCTIONS = 5
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ def _print(info: dict[str, Any], topomap: TopoMetricMap) -> None:
             ("nodes", f"{info['num_nodes']}, {info['num_points']} points with 3-D position"),
             ("side nodes", str(info["num_side_nodes"])),
             ("place images", str(info["num_place_images"])),
+            ("junctions", _format_junctions(info["junctions"])),
             ("mapped", f"{info['length_m']:.1f} m, extent {extent} m"),
             ("recordings", ", ".join(of_sessions or info["recordings"])),
             ("on earth", place),
@@ -120,6 +122,16 @@ def _print(info: dict[str, Any], topomap: TopoMetricMap) -> None:
         ]
     )
     print_quarters(certificate.quarters if certificate else [])
+
+
+def _format_junctions(junctions: list[dict[str, Any]]) -> str:
+    texts = [
+        f"node {one['node']} at {', '.join(f'{value:.1f}' for value in one['position'])}"
+        for one in junctions[:MAX_JUNCTIONS]
+    ]
+    left_out = len(junctions) - len(texts)
+    listed = "; ".join([*texts, f"{left_out} more (--json)"] if left_out else texts)
+    return f"{len(junctions)}: {listed}" if listed else "none"
 
 
 def _describe_certificate(certificate: dict[str, Any] | None) -> str:
@@ -148,7 +160,7 @@ class MapGraph:
     """`nodes` by their ids and `edges` by the ids of source and target, each with its facts.
 
     Facts of a node: session, name, world_from_cam (x, y, z in metres; qw, qx, qy, qz), number of
-    points, number of outgoing edges, and whether it is a junction with more than two neighbours.
+    points, number of outgoing edges, and whether it is the node nearest to a junction.
     Facts of an edge: metres, source_from_target, and how often mapping images traversed it.
     """
 
@@ -159,10 +171,8 @@ class MapGraph:
 def build_graph(topomap: TopoMetricMap) -> MapGraph:
     """Return the graph of a map. Traversals are counted from its place images."""
     poses = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
-    out, neighbours = Counter(edge.source_id for edge in topomap.edges), defaultdict(set)
-    for edge in topomap.edges:
-        neighbours[edge.source_id].add(edge.target_id)
-        neighbours[edge.target_id].add(edge.source_id)
+    out = Counter(edge.source_id for edge in topomap.edges)
+    junctions = {one["node"] for one in core_names.describe_junctions(topomap)}
     nodes: dict[int, dict[str, Any]] = {
         s.node_id: {
             "session": s.session_id,
@@ -170,7 +180,7 @@ def build_graph(topomap: TopoMetricMap) -> MapGraph:
             **_pose(s.world_from_cam),
             "points": s.num_points,
             "ways_out": out[s.node_id],
-            "is_junction": len(neighbours[s.node_id]) > 2,
+            "is_junction": s.node_id in junctions,
         }
         for s in topomap.summaries
     }
@@ -236,6 +246,8 @@ def _add_attributes(element: ElementTree.Element, of: str, facts: dict[str, Any]
 
 
 def _to_geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
+    from topoloc.apps.export.formats import coordinates, geojson_feature  # they need OpenCV
+
     georeference = topomap.georeference
     if georeference is None:
         raise GeoreferenceError(

@@ -56,6 +56,8 @@ class ServedMaps:
 
     def _open_maps(self) -> MapCache[Localizer]:
         """Return a cache of the maps, after the kernels are compiled."""
+        from topoloc.apps.service.tile_fetcher import TileFetcher
+
         warm_up(
             only_if_cold=lambda: print("compiling, once, a minute ...", file=sys.stderr, flush=True)
         )
@@ -65,7 +67,7 @@ class ServedMaps:
             self.paths,
             lambda topomap: open_localizer(topomap, self.localizer, self.features),
             self.service.memory_mb,
-            self.service.fetch_s,
+            TileFetcher(self.service.fetch_s).path,
         )
 
 

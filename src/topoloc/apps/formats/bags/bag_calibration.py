@@ -14,12 +14,13 @@ from topoloc import (
     StereoRig,
     UnreadableImageError,
 )
-from topoloc.apps.core_names import RosCalibration, replace_cameras
+from topoloc.apps.core_names import replace_cameras
 from topoloc.apps.formats.bags.bag import Bag
 from topoloc.apps.formats.bags.bag_images import camera_info, message_size, reduce_to_part
 from topoloc.apps.formats.bags.bag_poses import TransformTree
 from topoloc.apps.formats.bags.messages import decode
 from topoloc.apps.formats.bags.topics import Roles, is_rectified, is_registered
+from topoloc.apps.formats.calibrations.ros_calibration import RosCalibration
 from topoloc.plugin import CameraCalibration, read_camera_json
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt16
 
 from topoloc import CalibrationError, Image, UnreadableImageError, read_depth, read_image
-from topoloc.apps.core_names import MAX_PIXELS, RosCalibration
+from topoloc.apps.core_names import MAX_PIXELS
 from topoloc.apps.formats.bags.messages import frame_id, image_bytes
+from topoloc.apps.formats.calibrations.ros_calibration import RosCalibration
 from topoloc.plugin import EncodedImage, image_size
 
 # Type of a pixel, number of channels, and OpenCV's conversion to RGB (None for grey and RGB).

@@ -15,7 +15,8 @@ import numpy as np
 from msgspec import Struct
 
 from topoloc import CalibrationError, Camera
-from topoloc.apps.core_names import CalibrationForSize, Positive, RosCalibration, make_camera
+from topoloc.apps.core_names import CalibrationForSize, Positive, make_camera
+from topoloc.apps.formats.calibrations.ros_calibration import RosCalibration
 from topoloc.plugin import CameraCalibration, Finite, decode_json
 
 MakePinhole = Callable[[float, float, float, float, int, int], Camera]

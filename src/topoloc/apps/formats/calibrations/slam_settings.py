@@ -15,13 +15,13 @@ import numpy as np
 
 from topoloc import CalibrationError, Camera, Rigid3, TrajectoryError
 from topoloc.apps.core_names import (
-    RosCalibration,
     make_camera,
     make_rig,
     read_yaml,
     yaml_numbers,
     yaml_word,
 )
+from topoloc.apps.formats.calibrations.ros_calibration import RosCalibration
 from topoloc.plugin import CameraCalibration, parse_relative_path
 
 _Size = tuple[float, float]

@@ -7,7 +7,7 @@ import { centreCovariance, ellipsoidMatrix, matrixOf, numbersOf, pictureCorners 
 import { isLocalized } from "topoloc/words";
 
 const SET_COLOURS = ["#12a594", "#7c6ff0", "#d9822b", "#3f8fe0", "#94ad12", "#c95fc2"];
-export const COLOURS = { node: "#5f86bd", path: "#5f86bd", alternative: "#f0a202", bad: "#e5484d", error: "#f0a202", selected: "#ff3d81", note: "#d9a400" };
+export const COLOURS = { node: "#5f86bd", path: "#5f86bd", alternative: "#f0a202", bad: "#e5484d", error: "#f0a202", selected: "#ff3d81", note: "#d9a400", junction: "#8e4ec6" };
 
 /** Colours of the axes x, y and z. */
 export const AXIS_COLOURS = ["#d6404a", "#2f9e44", "#2f7fe0"];

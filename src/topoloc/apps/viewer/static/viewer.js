@@ -55,6 +55,7 @@ export class Viewer {
     const frustums = objects.frustumsOf(cameras, this.depth, objects.COLOURS.node, { opacity: 0.6 });
     this.layer("nodes", frustums, `${nodes.length} nodes`, objects.COLOURS.node);
     nodes.forEach((node, i) => this.places.push(this.nodePlace(node, cameras[i].matrix)));
+    this.addJunctions(this.document.junctions ?? []);
     if (nodes.some((node) => node.picture)) this.layer("pictures", null, "their images");
     paths.forEach((path, n) => {
       const ofMap = path.session !== undefined;
@@ -62,6 +63,19 @@ export class Viewer {
       const label = `${ofMap ? "trajectory of" : "trajectory"} ${path.name}`;
       this.layer(`path ${n}`, objects.linesOf(path.lines, colour), label, colour);
     });
+  }
+
+  /** Mark the places where walks branch or cross, if there are any. */
+  addJunctions(junctions) {
+    if (!junctions.length) return;
+    const { junction } = objects.COLOURS;
+    const counted = `${junctions.length} junction${junctions.length === 1 ? "" : "s"}`;
+    this.layer("junctions", objects.marksOf(junctions.map((one) => one.position), junction), counted, junction);
+    for (const { node, tile, position, ways } of junctions) {
+      const label = `junction at node ${node}${tile === undefined ? "" : ` of ${tile}`}`;
+      const show = () => this.tell(`J${label.slice(1)}`, [`At ${pointText(position)}.`, `${ways} directions lead away.`]);
+      this.places.push({ key: label, label, group: "Junctions", centre: position, show });
+    }
   }
 
   nodePlace(node, matrix) {

@@ -1,4 +1,4 @@
-"""Convert a calibration of ROS: K, D, R and P of a camera (REP 104), from messages or files.
+"""Read a calibration of ROS: K, D, R and P of a camera (REP 104), from messages or files.
 
 K and D give the camera of raw images, P that of rectified ones. In ROS the centre of the top-left
 pixel is (0, 0), as in topoloc.
@@ -7,14 +7,20 @@ pixel is (0, 0), as in topoloc.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import CalibrationError, TrajectoryError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import StereoRig
-from topoloc.geometry.rigid import Rigid3
+from topoloc import CalibrationError, Camera, Rigid3, StereoRig, TrajectoryError
+from topoloc.apps.core_names import (
+    read_yaml,
+    require_numbers,
+    yaml_image_size,
+    yaml_numbers,
+    yaml_word,
+)
+from topoloc.plugin import CameraCalibration
 
 _NO_DISTORTION = ("", "none", "plumb_bob", "rational_polynomial")
 _MAX_BASELINE = 1000.0  # metres; a larger one comes from a damaged number
@@ -117,3 +123,32 @@ class RosCalibration:
         params = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *coefficients)
         with CalibrationError.at(self.name):
             return Camera(model, self.width, self.height, tuple(float(value) for value in params))
+
+
+def read_ros_pair(left: Path, right: Path, size: tuple[float, float]) -> CameraCalibration | None:
+    """Read the pair of two files, one a camera. `size` (width and height, pixels) is used if a file
+    contains none. None if they do not contain the baseline. Raises CalibrationError with the file
+    name."""
+    one, other = (_read_ros_file(path, size) for path in (left, right))
+    rig = one.rig(other, is_rectified=False)
+    return rig and CameraCalibration(rig.left, rig)
+
+
+def _read_ros_file(path: Path, size: tuple[float, float]) -> RosCalibration:
+    text = read_yaml(path)
+    width, height = (int(min(length, 1e9)) for length in yaml_image_size(text) or size)
+    numbers = {
+        key: np.array(require_numbers(path, text, count, f"{key}_matrix"))
+        for key, count in (("camera", 9), ("rectification", 9), ("projection", 12))
+    }
+    return RosCalibration(
+        name=str(path),
+        frame="",
+        width=width,
+        height=height,
+        model=yaml_word(text, "distortion_model", ""),
+        distortion=np.array(yaml_numbers(text, "distortion_coefficients")),
+        matrix=numbers["camera"].reshape(3, 3),
+        rotation=numbers["rectification"].reshape(3, 3),
+        projection=numbers["projection"].reshape(3, 4),
+    )

@@ -1,5 +1,4 @@
-"""Follow atlases that others change, and fetch tiles from object stores in background threads, so
-that no query thread waits for a store.
+"""Fetch tiles from object stores in background threads, so that no query thread waits for a store.
 
 A caller that needs a missing tile gets `TilePending`. It may wait for the fetch elsewhere and try
 again. A tile is fetched once for any number of callers. After a timeout callers get an error, but
@@ -10,76 +9,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Hashable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.manifest import Tile
-from topoloc.atlas.store import store_at
-from topoloc.errors import AtlasError, ObjectStoreError
+from topoloc import Atlas, ObjectStoreError, Tile
+from topoloc.apps.core_names import RETRY_AFTER_S
 
 _MAX_CONCURRENT_FETCHES = 16
 """Maximum number of concurrent fetches from one store. Other stores are not affected."""
-RETRY_AFTER_S = 5.0
-"""Seconds before a tile that could not be fetched or opened is tried again."""
-
-
-class WatchedAtlas:
-    """Hold the current version of an atlas, for long-running readers. It is opened again when its
-    manifest changes.
-
-    In a folder each access checks the manifest file. An object store may take a minute to respond.
-    There `look` is called now and then in the background, and readers continue with the last
-    version, even while the store does not respond.
-
-    Raises:
-        AtlasError: there is no atlas, or it is damaged.
-        ObjectStoreError: its store does not respond.
-        MissingExtraError: the extra for object stores is not installed.
-    """
-
-    def __init__(self, where: str) -> None:
-        self.where, self.is_remote = where, "://" in where
-        self._store, self._lock = store_at(where), threading.Lock()
-        self._version, self._atlas = self._check_version(), self._open()
-
-    def now(self) -> Atlas:
-        """Return the current atlas of a folder, or the last seen version of an object store.
-
-        Raises:
-            AtlasError: the atlas cannot be read.
-        """
-        if not self.is_remote:
-            with self._lock:
-                self.look()
-        return self._atlas
-
-    def look(self) -> bool:
-        """Open the atlas again if its manifest changed, and return whether it did. Only one thread
-        may call it at a time.
-
-        Raises AtlasError if the atlas is gone or damaged, ObjectStoreError if the store does not
-        respond.
-        """
-        version = self._check_version()
-        if version == self._version:
-            return False
-        self._version, self._atlas = version, self._open()
-        return True
-
-    def _check_version(self) -> Hashable:
-        version = self._store.version()
-        if version is None:
-            raise AtlasError(f"{self.where} is no atlas, or not any more: it has no manifest")
-        return version
-
-    def _open(self) -> Atlas:
-        atlas = Atlas.open(self.where)
-        if self.is_remote:
-            _ = atlas.index  # fetches the index files now, not during a query
-        return atlas
 
 
 @dataclass(eq=False)
