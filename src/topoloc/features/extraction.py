@@ -24,7 +24,7 @@ from topoloc.bounds import Above, AtLeast, Between
 from topoloc.compiled import kernel, parallel_for_rows
 from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.features import Features
-from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera import Camera, UncalibratedCamera, nominal_camera
 from topoloc.geometry.rigid import Rigid3
 
 
@@ -201,6 +201,15 @@ def extract_features(
     """
     normalized = normalize_image(image, config, num_threads)
     return replace(extract_from_normalized(normalized, config, num_threads), dense=None)
+
+
+def drop_masked(features: Features, camera: Camera | UncalibratedCamera) -> Features:
+    """Return the features that the mask of the image's camera does not leave out, and all dense
+    descriptors."""
+    if camera.mask is None:
+        return features
+    used = nominal_camera(camera).is_in_image(features.points_img)
+    return replace(features.select(used), dense=features.dense)
 
 
 def normalize_image(

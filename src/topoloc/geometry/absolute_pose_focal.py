@@ -189,9 +189,9 @@ def with_parameters(camera: Camera, parameters: Vector) -> Camera:
     focal = camera.fx * math.exp(parameters[0])
     cx, cy = camera.cx + camera.fx * parameters[1], camera.cy + camera.fx * parameters[2]
     if parameters[3] == 0.0:
-        return Camera.pinhole(camera.width, camera.height, focal, focal, cx, cy)
+        return replace(camera, model="PINHOLE", params=(focal, focal, cx, cy))
     values = tuple(float(value) for value in (focal, cx, cy, parameters[3], parameters[7]))
-    return Camera("RADIAL", camera.width, camera.height, values)
+    return replace(camera, model="RADIAL", params=values)
 
 
 def _search_focal_lengths(

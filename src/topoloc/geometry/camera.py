@@ -7,7 +7,7 @@ and left, is used only when COLMAP's files are read or written.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -56,6 +56,9 @@ _TWO_FOCAL_MODELS["SIMPLE_FISHEYE"] = "FISHEYE"
 class Camera(OneLine):
     """Hold one camera: COLMAP model name, image size in pixels, parameters in the model's order.
 
+    `mask`, of the image in any size, is False where the image moves with the camera, such as the
+    robot's own body. Files do not hold it.
+
     Raises:
         CalibrationError: the model is unknown, the number of parameters is wrong, values are not
             finite, or the focal length is not positive or not realistic.
@@ -65,6 +68,9 @@ class Camera(OneLine):
     width: int
     height: int
     params: tuple[float, ...]
+    mask: Bool[np.ndarray, "mask_h mask_w"] | None = field(
+        default=None, compare=False, kw_only=True
+    )
 
     @staticmethod
     def model_names() -> list[str]:
@@ -219,10 +225,16 @@ class Camera(OneLine):
         return max(max(self.width, self.height) / 640.0, 0.5)
 
     def is_in_image(self, points_img: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-        """Return which pixels are in the image. NaN is not."""
+        """Return which pixels are in the image and not left out by its mask. NaN is not."""
         size = np.array([self.width, self.height])
         with np.errstate(invalid="ignore"):
-            return np.all((points_img >= -0.5) & (points_img < size - 0.5), axis=1)
+            inside = np.all((points_img >= -0.5) & (points_img < size - 0.5), axis=1)
+        if self.mask is not None:
+            ends = np.array(self.mask.shape[::-1])
+            cells = (points_img[inside] + 0.5) * (ends / size)
+            columns, rows = np.minimum(cells.astype(int), ends - 1).T
+            inside[inside] = self.mask[rows, columns]
+        return inside
 
     def with_focal(self, focal: float) -> Camera:
         """Return the camera with this focal length (pixels) in both directions."""
@@ -256,7 +268,7 @@ class Camera(OneLine):
             "cy": (self.cy + 0.5) * scale_y - 0.5,
         }
         params = (scaled.get(name, self._param(name)) for name in MODELS[model])
-        return Camera(model, width, height, tuple(params))
+        return Camera(model, width, height, tuple(params), mask=self.mask)
 
     def to_colmap(self) -> tuple[str, int, int, tuple[float, ...]]:
         """Return (model, width, height, params) in COLMAP's convention: the centre of the top-left
@@ -315,8 +327,8 @@ FOCAL_GUESS_TOLERANCE = 1.15
 
 @dataclass(frozen=True)
 class UncalibratedCamera:
-    """Hold a pinhole with square pixels, its principal point in the image centre, and a focal
-    length (pixels) between two bounds.
+    """Hold a pinhole with square pixels, its principal point in the image centre, a focal length
+    (pixels) between two bounds, and `Camera.mask`.
 
     Raises:
         CalibrationError: the size is not positive, or the range is not one of positive lengths.
@@ -326,6 +338,9 @@ class UncalibratedCamera:
     height: int
     min_focal: float
     max_focal: float
+    mask: Bool[np.ndarray, "mask_h mask_w"] | None = field(
+        default=None, compare=False, kw_only=True
+    )
 
     def __post_init__(self) -> None:
         is_range = 0.0 < self.min_focal <= self.max_focal < math.inf
@@ -353,14 +368,14 @@ class UncalibratedCamera:
 
     def with_focal(self, focal: float) -> Camera:
         """Return the pinhole camera of this focal length (pixels)."""
-        return Camera.pinhole(
-            self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2
-        )
+        centre = (self.width - 1) / 2, (self.height - 1) / 2
+        return Camera("PINHOLE", self.width, self.height, (focal, focal, *centre), mask=self.mask)
 
     def rescaled(self, width: int, height: int) -> UncalibratedCamera:
         """Return the camera of the image resized to width x height."""
         scale = math.sqrt(width * height / (self.width * self.height))
-        return UncalibratedCamera(width, height, self.min_focal * scale, self.max_focal * scale)
+        focals = self.min_focal * scale, self.max_focal * scale
+        return UncalibratedCamera(width, height, *focals, mask=self.mask)
 
 
 def nominal_camera(camera: Camera | UncalibratedCamera) -> Camera:

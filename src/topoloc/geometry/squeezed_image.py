@@ -147,7 +147,7 @@ def _squeezed(found: _Found, log_ratio: float, image: UncalibratedCamera) -> _Fo
     ratio = math.exp(log_ratio)
     fy, cy = c.fy * ratio, (c.cy + 0.5) * ratio - 0.5
     if c.model == "PINHOLE":
-        return pose, Camera.pinhole(image.width, image.height, c.fx, fy, c.cx, cy)
-    k1, k2 = c.params[3:5]
-    values = c.fx, fy, c.cx, cy, k1, k2, 0.0, 0.0
-    return pose, Camera("OPENCV", image.width, image.height, values)
+        values, model = (c.fx, fy, c.cx, cy), "PINHOLE"
+    else:
+        values, model = (c.fx, fy, c.cx, cy, *c.params[3:5], 0.0, 0.0), "OPENCV"
+    return pose, Camera(model, image.width, image.height, values, mask=image.mask)

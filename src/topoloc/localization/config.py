@@ -91,6 +91,9 @@ class LocalizerConfig(OneLine):
     (None: all whose networks are installed)."""
     coarse: str | None = None
     """Name of the map's coarse localizer (None: the map's default)."""
+    mask: str | None = None
+    """Image file that is black where queries show what moves with the camera, such as the robot's
+    own body, and white elsewhere. Of the queries' size, or scaled with it."""
     max_ms: Annotated[float | None, AtLeast(0)] = None
     """Time limit in milliseconds, after which no further hypothesis is tested (None: no limit)."""
     exactness: Literal["best", "fast"] = "best"

@@ -156,7 +156,7 @@ def _project_points(
     """Return the map points in the camera frame (metres) and their pixels, NaN if out of view."""
     if not camera.is_distorted:
         fx, fy, cx, cy = camera.intrinsics
-        return project_undistorted(
+        points_cam, pixels = project_undistorted(
             local_map.points_world,
             np.ascontiguousarray(cam_from_world.rotation),
             np.ascontiguousarray(cam_from_world.translation),
@@ -165,8 +165,11 @@ def _project_points(
             camera.width,
             camera.height,
         )
-    points_cam = cam_from_world.apply(local_map.points_world)
-    pixels = camera.img_from_cam(points_cam)
+        if camera.mask is None:
+            return points_cam, pixels
+    else:
+        points_cam = cam_from_world.apply(local_map.points_world)
+        pixels = camera.img_from_cam(points_cam)
     return points_cam, np.where(camera.is_in_image(pixels)[:, None], pixels, np.nan)
 
 

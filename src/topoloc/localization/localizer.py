@@ -20,6 +20,7 @@ import copy
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,7 @@ from topoloc.localization.search import Trace
 from topoloc.localization.tiles.tiles import Reach, TileRanking, Tiles
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
+from topoloc.recordings.image_mask import read_mask, with_mask
 from topoloc.retrieval.coarse import CoarseLocalizer, Image
 
 if TYPE_CHECKING:
@@ -71,6 +73,7 @@ class Localizer:
 
     Raises:
         ConfigError: a setting is out of bounds.
+        UnreadableImageError: the mask of `config` is no image; CalibrationError: it is all black.
         FeatureTypeError: the map's feature type is unknown.
         EmptyMapError: the map has no node.
         MapError: the map file cannot be read, or the map has no such coarse localizer.
@@ -95,11 +98,12 @@ class Localizer:
         self._reach: Reach | None = None
         self._nothing_in_reach = ""
         self._options = coarse, weights, features, tiles
-        if isinstance(source, MapContext):
-            self.config, self.source, self._options = source.config, source.topomap, None
-            self._tiles = Tiles(source)
+        is_open = isinstance(source, MapContext)
+        self.config = source.config if is_open else config or LocalizerConfig()
+        self._mask = None if self.config.mask is None else read_mask(self.config.mask)
+        if is_open:
+            self.source, self._options, self._tiles = source.topomap, None, Tiles(source)
             return
-        self.config = config or LocalizerConfig()
         check_bounds(self.config)
 
         def open_context(topomap: TopoMetricMap) -> MapContext:
@@ -230,6 +234,7 @@ class Localizer:
 
         Raises:
             QueryError: the image is not an 8-bit image, or its size differs from the camera's.
+            CalibrationError: the image has another shape than the mask of `config`.
             AtlasError: there is no such tile, a prior comes without one, or no tile can be read.
             ObjectStoreError: the object store of a required tile does not respond.
         """
@@ -251,6 +256,9 @@ class Localizer:
         its features, which several maps can share.
         """
         deadline = Deadline.from_limit(self.config.max_ms if max_ms is None else max_ms)
+        if self._mask is not None:
+            masked = with_mask(query_image.camera, self._mask)
+            query_image = replace(query_image, camera=masked)
         schedule = Schedule(
             self._tiles, self.tile_config, query_image, deadline, self._reach, trace
         )

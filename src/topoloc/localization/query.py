@@ -21,10 +21,16 @@ import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.errors import QueryError
-from topoloc.features.extraction import FeatureConfig, extract_from_normalized, normalize_image
+from topoloc.features.extraction import (
+    FeatureConfig,
+    drop_masked,
+    extract_from_normalized,
+    normalize_image,
+)
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera, UncalibratedCamera, nominal_camera
 from topoloc.recordings.frame import find_image_problem, to_grey
+from topoloc.recordings.image_mask import fill_masked
 from topoloc.retrieval.coarse import Image
 
 
@@ -126,7 +132,8 @@ class StoredFeatures(SharedFeatures):
 
 @dataclass(frozen=True, eq=False)
 class QueryImage:
-    """Hold an image and its camera model, to be localized in one map or several.
+    """Hold an image and its camera model, to be localized in one map or several. What the camera's
+    mask leaves out is filled.
 
     Raises:
         QueryError: see `check_image_size`.
@@ -138,6 +145,8 @@ class QueryImage:
 
     def __post_init__(self) -> None:
         check_image_size(self.image, self.camera)
+        if self.camera.mask is not None:
+            object.__setattr__(self, "image", fill_masked(self.image, self.camera.mask))
 
     @staticmethod
     def of_features(known: Mapping[str, Features], camera: Camera) -> QueryImage:
@@ -189,7 +198,8 @@ class Query:
         with self.clock.stage("patch_normalization"):
             normalized = normalize_image(self.grey, self.feature_config)
         with self.clock.stage("features"):
-            return extract_from_normalized(normalized, self.feature_config)
+            features = extract_from_normalized(normalized, self.feature_config)
+            return drop_masked(features, self.input_camera)
 
 
 def check_image_size(image: Image, camera: Camera | UncalibratedCamera) -> None:

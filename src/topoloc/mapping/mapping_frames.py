@@ -18,7 +18,7 @@ import cv2
 
 from topoloc.compiled import parallel_map
 from topoloc.errors import TrajectoryError
-from topoloc.features.extraction import extract_features
+from topoloc.features.extraction import drop_masked, extract_features
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.camera import Camera
@@ -154,7 +154,8 @@ def extract_mapping_image(
     """Extract the features of all types from a frame that has been read."""
     jpeg, light = encode_place_image(view.picture), Illumination.of_image(view.picture)
     features = {
-        kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
+        kind: drop_masked(extract_features(view.grey, config.feature_config_for(kind)), view.camera)
+        for kind in config.kinds
     }
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     return MappingImage(view.camera, world_from_view, features, jpeg, light)

@@ -3,7 +3,7 @@ depth."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -17,6 +17,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig, rectify
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import DepthImage, Image, StereoFrame, to_grey
+from topoloc.recordings.image_mask import scale_mask
 
 
 @kernel(error_model="numpy")
@@ -147,10 +148,14 @@ def _prepare_stereo(image: Image, right: Image | None, rig: StereoRig) -> Prepar
     picture = _remap(image, r.left_map)
     if right_grey is not None:
         right_grey = _remap(right_grey, r.right_map)
+    camera = r.rig.left
+    if rig.left.mask is not None:
+        scaled = scale_mask(rig.left.mask, camera.width, camera.height)
+        camera = replace(camera, mask=_remap(scaled, r.left_map) > 0)
     return PreparedFrame(
         picture,
         to_grey(picture),
-        r.rig.left,
+        camera,
         r.rectified_from_left,
         right_grey,
         r.rig,

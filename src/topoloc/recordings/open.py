@@ -13,6 +13,7 @@ from topoloc.recordings.depth_range import leave_out_stuck_depth
 from topoloc.recordings.format import RecordingFormat, load_reader
 from topoloc.recordings.frame import StereoSequence, sequence_subset
 from topoloc.recordings.image_files import find_path
+from topoloc.recordings.image_mask import mask_recording, read_mask
 from topoloc.recordings.recording import leave_out_damaged, recording_notes
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
@@ -56,6 +57,7 @@ def open_sequence(
     topics: str | Mapping[str, str] | None = None,
     warn: Callable[[str], None] | None = None,
     whole_only: bool = False,
+    mask: str | Path | None = None,
 ) -> StereoSequence:
     """Open a recording, or a selection of its frames. Images are read when a frame is accessed.
 
@@ -72,6 +74,9 @@ def open_sequence(
         warn: called with each note on the recording, such as truncated or guessed data.
         whole_only: leave out the frames with a missing, empty or truncated image file, and depth
             that sticks at the end of the sensor's range. Notes say so.
+        mask: an image that is black where the pictures (of a pair the left ones) show what moves
+            with the camera, such as the robot's own body, and white elsewhere. It is of their size,
+            or scaled with it.
 
     Raises:
         UnknownFormatError: `format` is unknown, or no format recognises the folder.
@@ -91,6 +96,8 @@ def open_sequence(
         if not indices:
             raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
         sequence = sequence_subset(sequence, indices)
+    if mask is not None:
+        sequence = mask_recording(sequence, read_mask(mask))
     if not whole_only:
         return sequence
     return leave_out_stuck_depth(leave_out_damaged(sequence, warn), warn)

@@ -42,6 +42,6 @@ def find_still_part(sequence: StereoSequence) -> str | None:
     lines = f"{top * height // _ROWS} to {(bottom + 1) * height // _ROWS - 1}"
     return (
         f"{sequence.name}: a part of the picture (columns {columns}, rows {lines}) moves with the"
-        " camera, such as the robot's own body, and spoils motion and map; crop the pictures, or"
-        " paint this part in one grey, those of the right camera and of the queries, too"
+        " camera, such as the robot's own body, and spoils motion and map; give a picture that is"
+        " black there and white elsewhere: --mask FILE, here and with queries"
     )

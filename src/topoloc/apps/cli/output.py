@@ -56,6 +56,15 @@ CameraOption = Annotated[
         " YAML, COLMAP's cameras.txt, SN*.conf, or `fx,fy,cx,cy`.",
     ),
 ]
+MaskOption = Annotated[
+    str | None,
+    option(
+        "FILE",
+        "none",
+        help="Mask of the images: a PNG that is black where they show what moves with the camera,"
+        " such as the robot's own body, and white elsewhere. Of their size, or scaled with it.",
+    ),
+]
 Topics = Annotated[
     str | None,
     option(
@@ -85,9 +94,11 @@ def open_recording(
     topics: str | None = None,
     images: str | None = None,
     whole_only: bool = False,
+    mask: str | None = None,
 ) -> topoloc.StereoSequence:
     """Open a recording and print its notes on standard error. See `open_sequence` for errors."""
-    return topoloc.open_sequence(path, format, camera, images, topics, print_warning, whole_only)
+    words = path, format, camera, images, topics
+    return topoloc.open_sequence(*words, print_warning, whole_only, mask)
 
 
 def describe_recording(

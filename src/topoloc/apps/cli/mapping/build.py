@@ -27,6 +27,7 @@ from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
+    MaskOption,
     PosesOption,
     RayOption,
     Topics,
@@ -70,6 +71,7 @@ class Command:
     """Map a recording if fewer than half of its frames have a pose."""
     format: Format = None
     camera: CameraOption = None
+    mask: MaskOption = None
     images: Annotated[str | None, option("FOLDER", "images/ beside the model")] = None
     """Images of a COLMAP model."""
     scale: Annotated[
@@ -148,6 +150,7 @@ class Command:
             self.camera,
             self.images,
             self.topics,
+            self.mask,
         )
 
     def _make_map(self, map_job: MapJob, target: Path) -> int:

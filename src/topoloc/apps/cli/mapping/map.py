@@ -25,6 +25,7 @@ from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
+    MaskOption,
     Topics,
     UsageError,
     catch_stop_signals,
@@ -57,6 +58,7 @@ class Command:
     """At the end, give the map a world with z up and the floor at z = 0, see `topoloc level`."""
     format: Format = None
     camera: CameraOption = None
+    mask: MaskOption = None
     topics: Topics = None
     features: BUILD_FEATURES = None
     """Feature types of the map. `learned`: the first network of `topoloc weights list` that is
@@ -73,7 +75,7 @@ class Command:
             raise UsageError(f"--piece {self.piece}: at least 20 frames show a motion")
         if not self.idle > 0.0:
             raise UsageError(f"--idle {self.idle:g}: seconds above 0 are needed")
-        check_outputs([self.map, self.json], [self.source])
+        check_outputs([self.map, self.json], [self.source, self.mask])
         config = read_settings(self.config).get(BuildConfig)
         growing = GrowingMap(self.map, select_build_features(config, self.features))
         num_frames, num_lost, began = 0, 0, time.monotonic()
@@ -111,7 +113,7 @@ class Command:
     def _pieces(self, stop: threading.Event) -> Iterator[tuple[StereoSequence, int]]:
         """Yield the recording and the number of its frames up to the end of the next piece."""
         words = self.source, self.format, self.camera, self.topics
-        sequence = self._open(stop) if self.live else open_recording(*words)
+        sequence = self._open(stop) if self.live else open_recording(*words, mask=self.mask)
         if self.json != "-":
             print_line(describe_recording(*words[:3], sequence))
         done, began = 0, time.monotonic()
@@ -146,7 +148,7 @@ class Command:
         began = time.monotonic()
         while True:
             try:
-                return open_sequence(self.source, self.format, self.camera, None, self.topics)
+                return self._open_now()
             except TopolocError:
                 if stop.is_set() or time.monotonic() - began > self.idle:
                     raise
@@ -155,6 +157,10 @@ class Command:
     def _reopen(self, sequence: StereoSequence) -> StereoSequence:
         """Return the recording with its new frames, if it can be read at this moment."""
         try:
-            return open_sequence(self.source, self.format, self.camera, None, self.topics)
+            return self._open_now()
         except TopolocError:  # a frame is being written
             return sequence
+
+    def _open_now(self) -> StereoSequence:
+        words = self.source, self.format, self.camera, None, self.topics
+        return open_sequence(*words, mask=self.mask)

@@ -71,6 +71,7 @@ class MapJob:
     camera: str | None = None
     images: str | None = None
     topics: str | None = None
+    mask: str | None = None
 
     def make(
         self, progress: Progress, tell: Callable[[str], None] | None = None
@@ -109,7 +110,7 @@ class MapJob:
         """Return the digest of settings, versions, and names, sizes and times of all files, 64
         hexadecimal digits. Raises RecordingError if a recording is missing."""
         files = [path for text in self.recordings for path in _list_files(split_selection(text)[0])]
-        for text in (*self.pose_options.trajectory, self.camera, self.images):
+        for text in (*self.pose_options.trajectory, self.camera, self.images, self.mask):
             if text and os.path.exists(text):
                 files += _list_files(Path(text))
         facts = {
@@ -136,12 +137,8 @@ class MapJob:
     def _open(self, tell: Callable[[str], None] | None) -> tuple[list[StereoSequence], list[str]]:
         """Return the recordings with their poses and the sources of these. With `slam` the poses
         are computed later."""
-        sequences = [
-            keep_frames(
-                open_recording(path, self.format, self.camera, self.topics, self.images, True)
-            )
-            for path in self.recordings
-        ]
+        how = self.format, self.camera, self.topics, self.images, True, self.mask
+        sequences = [keep_frames(open_recording(path, *how)) for path in self.recordings]
         if tell is not None:
             for path, sequence in zip(self.recordings, sequences, strict=True):
                 tell(describe_recording(path, self.format, self.camera, sequence))

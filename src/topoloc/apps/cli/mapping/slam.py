@@ -14,6 +14,7 @@ from topoloc.apps.cli.output import (
     CameraOption,
     File,
     Format,
+    MaskOption,
     Topics,
     check_outputs,
     describe_recording,
@@ -37,14 +38,15 @@ class Command:
     the first frame."""
     format: Format = None
     camera: CameraOption = None
+    mask: MaskOption = None
     topics: Topics = None
     json: File = None
     """Write the printed facts as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
-        check_outputs([self.out, self.json], [self.sequence])
+        check_outputs([self.out, self.json], [self.sequence, self.mask])
         words = self.sequence, self.format, self.camera, self.topics
-        sequence = open_recording(*words, whole_only=True)
+        sequence = open_recording(*words, whole_only=True, mask=self.mask)
         if self.json != "-":
             print_line(describe_recording(*words[:3], sequence))
         start = time.perf_counter()

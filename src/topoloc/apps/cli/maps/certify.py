@@ -24,6 +24,7 @@ from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
+    MaskOption,
     PosesOption,
     UsageError,
     check_outputs,
@@ -37,7 +38,7 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 from topoloc.apps.cli.queries.evaluate import read_rigid
-from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.quality.certificate_texts import (
     describe_condition,
     describe_group,
@@ -74,6 +75,7 @@ class Command:
     to the nearest mapped frame, or by each. The threshold stays one for all."""
     format: Format = None
     camera: CameraOption = None
+    mask: MaskOption = None
     poses: PosesOption = None
     """Convention of the true poses if it is not world_from_cam in metres."""
     json: File = None
@@ -92,6 +94,7 @@ class Command:
         write_page = _import_page_writer() if self.report else None
         map_from_truth = read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         config = read_settings(self.config).get(LocalizerConfig)
+        config = with_option(config, "mask", self.mask, "--mask")
         walks, others = ([self._open(one) for one in of] for of in (self.walk, self.out_of_map))
         if self.by and not any(pose for walk in walks for pose in walk.poses):
             raise UsageError("--by groups the images of walks with true poses: add --walk SEQ")

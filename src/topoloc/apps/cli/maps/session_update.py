@@ -44,11 +44,12 @@ class SessionUpdateOptions:
     camera: str | None = None
     topics: str | None = None
     light: str | None = None
+    mask: str | None = None
 
     def open_session(self) -> OpenSessionUpdate:
         """Open the recording and print its notes to standard error. Raises RecordingError."""
         words = self.recording, self.format, self.camera, self.topics
-        return OpenSessionUpdate(self, open_recording(*words, whole_only=True))
+        return OpenSessionUpdate(self, open_recording(*words, whole_only=True, mask=self.mask))
 
 
 class OpenSessionUpdate:

@@ -22,6 +22,7 @@ from topoloc.apps.cli.output import (
     CameraOption,
     File,
     Format,
+    MaskOption,
     PosesOption,
     RayOption,
     Topics,
@@ -60,6 +61,7 @@ class Command:
     """Convention of the poses of truth or FILE, as in `topoloc build`."""
     format: Format = None
     camera: CameraOption = None
+    mask: MaskOption = None
     topics: Topics = None
     light: Annotated[str | None, option("NAME", "from the images")] = None
     """Name of the illumination, such as `evening`. Sessions of one name have one illumination."""
@@ -100,7 +102,7 @@ class Command:
         if self.light is not None and not self.light.strip():
             raise UsageError("--light is a name, such as evening")
         place = open_place(self.paths[0])
-        check_outputs([self.json, self.joined], [*self.paths, self.config])
+        check_outputs([self.json, self.joined], [*self.paths, self.config, self.mask])
         settings = read_settings(self.config)
         return place.visit(
             lambda path: self._update_map(path, settings),
@@ -109,8 +111,8 @@ class Command:
 
     def _session_options(self, settings: Settings) -> list[SessionUpdateOptions]:
         read = (self.trajectory, self.poses, self.format, self.camera, self.topics, self.light)
-        config = settings.get(LocalizerConfig)
-        return [SessionUpdateOptions(path, config, *read) for path in self.paths[1:]]
+        config, mask = settings.get(LocalizerConfig), self.mask
+        return [SessionUpdateOptions(path, config, *read, mask) for path in self.paths[1:]]
 
     def _update_map(self, target: str, settings: Settings) -> int:
         if self.tile is not None or self.ray is not None:

@@ -28,6 +28,7 @@ from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
+    MaskOption,
     PosesOption,
     RayOption,
     Topics,
@@ -81,6 +82,7 @@ class Command:
     features: QUERY_FEATURES = None
     format: Format = None
     camera: CameraOption = None
+    mask: MaskOption = None
     poses: PosesOption = None
     """Convention of the true poses if it is not world_from_cam in metres: inverse, opengl, wxyz,
     mm, as in `build`."""
@@ -104,6 +106,7 @@ class Command:
         self._check_usage()
         settings = read_settings(self.config)
         config = with_option(settings.get(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        config = with_option(config, "mask", self.mask, "--mask")
         localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         tile_id = self._select_tile(localizer)
         with localizer.in_tile(tile_id) as in_tile:

@@ -25,7 +25,15 @@ from topoloc.apps.cli.features_option import (
     open_localizer,
     parse_camera,
 )
-from topoloc.apps.cli.output import File, UsageError, check_outputs, option, print_line, write_json
+from topoloc.apps.cli.output import (
+    File,
+    MaskOption,
+    UsageError,
+    check_outputs,
+    option,
+    print_line,
+    write_json,
+)
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.core_names import as_monocular
 from topoloc.apps.query_camera import select_frame_camera
@@ -46,6 +54,7 @@ class Command:
         str | None, option("FILE|fx,fy,cx,cy|map|unknown", "that of the recording")
     ] = None
     """Calibration of the image, as in `topoloc localize`."""
+    mask: MaskOption = None
     coarse: CoarseOption = None
     features: QUERY_FEATURES = None
     out: File = None
@@ -59,6 +68,7 @@ class Command:
         check_outputs([self.out, self.json], [self.map, self.config])
         settings = read_settings(self.config)
         config = with_option(settings.get(LocalizerConfig), "coarse", self.coarse, "--coarse")
+        config = with_option(config, "mask", self.mask, "--mask")
         localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         frame = self._read_frame()
         of_size = None if self.camera is None else parse_camera(localizer, self.camera)

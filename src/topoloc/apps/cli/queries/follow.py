@@ -29,6 +29,7 @@ from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
+    MaskOption,
     Topics,
     UsageError,
     catch_stop_signals,
@@ -38,7 +39,7 @@ from topoloc.apps.cli.output import (
     print_warning,
 )
 from topoloc.apps.cli.queries.query_answers import QueryFrame, capture_frames, format_answer
-from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.core_names import as_monocular
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.config import RobotConfig
@@ -62,6 +63,7 @@ class Command:
     ] = None
     """Calibration of the images: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in
     pixels, `map` for that of the map, or `unknown` to estimate it from the first images."""
+    mask: MaskOption = None
     format: Format = None
     topics: Topics = None
     """Topic of a bag: left=/cam0/image_raw."""
@@ -102,9 +104,8 @@ class Command:
 
     def run(self) -> int:
         settings = read_settings(self.config)
-        localizer = open_localizer(
-            self.map, settings.get(LocalizerConfig), self.features, settings.get(AtlasConfig)
-        )
+        config = with_option(settings.get(LocalizerConfig), "mask", self.mask, "--mask")
+        localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         if self.realtime and (is_topic(self.source) or is_live(self.source)):
             raise UsageError("--realtime plays a recording; leave it out for a live camera")
         if self.ros or self.mavlink is not None:

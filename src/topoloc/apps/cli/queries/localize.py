@@ -39,6 +39,7 @@ from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
+    MaskOption,
     Topics,
     UsageError,
     catch_stop_signals,
@@ -104,6 +105,7 @@ class Command:
     ] = None
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels,
     `map` for the map's camera, `unknown` to estimate it from all images of one size."""
+    mask: MaskOption = None
     save_camera: File = None
     """Write the camera that is estimated from images without calibration to this file
     (camera.json)."""
@@ -136,7 +138,7 @@ class Command:
             raise UsageError("localize takes a map and at least one image, folder or recording")
         live = next((path for path in self.inputs if is_live(path)), None)
         self._check_usage(live)
-        inputs = (self.map, *self.inputs, self.streams.odometry, self.config)
+        inputs = (self.map, *self.inputs, self.streams.odometry, self.config, self.mask)
         check_outputs([self.json, self.tum, self.save_camera], inputs)
         near, settings = self._parse_near(), read_settings(self.config)
         tracking = settings.get(TrackerConfig)
@@ -187,6 +189,7 @@ class Command:
     def _open_localizer(self, settings: Settings, near: GeoPositionPrior | None) -> Localizer:
         config = with_option(settings.get(LocalizerConfig), "coarse", self.coarse, "--coarse")
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
+        config = with_option(config, "mask", self.mask, "--mask")
         config = with_option(config, "evidence.tolerance", self._parse_tolerance(), "--tolerance")
         localizer = open_localizer(self.map, config, self.features, settings.get(AtlasConfig))
         return localizer if near is None else localizer.near(near)
