@@ -19,6 +19,7 @@ from jaxtyping import Float, UInt8
 from topoloc import Camera, Rigid3, TopoMetricMap, read_image
 from topoloc.apps import core_names
 from topoloc.apps.core_names import encode_jpeg
+from topoloc.apps.quality.certificate_texts import describe_group
 from topoloc.apps.viewer.map_scene import sample_node_colours, unique_image_names
 from topoloc.plugin import EncodedImage
 
@@ -99,8 +100,16 @@ def _describe_map(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
         "num_points_shown": num_shown,
         "length_m": topomap.length_m,
         "sessions": sessions,
-        "certificate": topomap.describe_certificate(),
+        "certificate": _describe_certificate(topomap),
     }
+
+
+def _describe_certificate(topomap: TopoMetricMap) -> dict[str, Any] | None:
+    """Return the certificate as JSON, with the promise of each group in words."""
+    facts, certificate = topomap.describe_certificate(), topomap.certificate
+    if facts is None or certificate is None:
+        return None
+    return facts | {"group_promises": [": ".join(describe_group(g)) for g in certificate.groups]}
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,7 +70,13 @@ def test_certify_prints_stores_and_draws_the_promise(
         assert "hardest to easiest" in text
     scene = tmp_path / "scene.json"
     assert main(["view", str(own_map), "--json", str(scene)]) == 0
-    assert json.loads(scene.read_text())["map"]["certificate"]["threshold"] in shown
+    certificate = json.loads(scene.read_text())["map"]["certificate"]
+    assert certificate["threshold"] in shown
+    assert len(certificate["group_promises"]) == len(found["groups"])
+    name, _, promise = certificate["group_promises"][0].partition(": ")
+    assert name.startswith(found["groups"][0]["by"])
+    assert name in shown
+    assert promise in shown
     assert main(["georeference", str(own_map), "--origin", "50.8,4.7,30,0"]) == 0
     capsys.readouterr()
     assert main(["info", str(own_map)]) == 0

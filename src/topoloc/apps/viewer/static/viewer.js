@@ -261,6 +261,7 @@ export class Viewer {
       const outdated = map.certificate.is_outdated ? " (outdated: the map was edited since)" : "";
       said.push(`Certified: ${map.certificate.promise}${outdated}.`);
       said.push(`Threshold: ${map.certificate.threshold}.`);
+      for (const promise of map.certificate.group_promises) said.push(`${promise[0].toUpperCase()}${promise.slice(1)}.`);
       const hardest = map.certificate.quarters.filter((one, row, all) => one.by !== all[row - 1]?.by);
       for (const one of hardest) said.push(`Hardest quarter by ${one.by}: ${one.num_right} of ${one.num_poses} right, ${one.num_inside} inside their 95 % ellipsoid.`);
     }
