@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from msgspec.structs import replace
 from scipy.optimize import minimize
-from topoloc.localization.proposals import votes
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization import propose
 from topoloc.localization.fitted_weights import compute_log_odds, load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
@@ -77,13 +77,13 @@ def ask(localizer: Localizer, recording: str, kind: str, found: Found, *, has_tr
     """Localize all images of a recording."""
     weights = replace(load_fitted_weights(kind).evidence, narrow_spread=0.0)
     limit, most = load_fitted_weights(kind).evidence.narrow_spread, list[float]()
-    find_places = votes.find_places
+    find_places = propose.find_places
 
     def noting(search: Search) -> Iterator[list[Row]]:
-        most.append(float(votes.count_votes(search)[2].max(initial=0.0)))
+        most.append(float(propose.count_votes(search)[2].max(initial=0.0)))
         return find_places(search)
 
-    votes.find_places = noting
+    propose.find_places = noting
     sequence = open_sequence(recording)
     for index in range(len(sequence)):
         frame, trace = sequence[index], Trace()
@@ -100,7 +100,7 @@ def ask(localizer: Localizer, recording: str, kind: str, found: Found, *, has_tr
                 continue
             if evidence.spread < limit and compute_log_odds(evidence, weights) > 0.5:
                 found.narrow.append((max(evidence.doubt, 0.05), right))
-    votes.find_places = find_places
+    propose.find_places = find_places
 
 
 def is_right(one: TriedProposal, truth: Rigid3 | None) -> bool | None:

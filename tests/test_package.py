@@ -225,7 +225,11 @@ def test_every_module_loads_without_extras_but_figures_and_messages():
         for name in ("certificate_page", "figures", "map_figure", "report", "weak_regions_page")
     }
     others = [name for name in not_loaded if name not in drawing]
-    assert others == ["topoloc.apps.formats.bags.mcap_file", "topoloc.apps.robots.ros_messages"]
+    assert others == [
+        "topoloc.apps.formats.bags.mcap_file",
+        "topoloc.apps.robots.ros_announcement",
+        "topoloc.apps.robots.ros_messages",
+    ]
     assert {"torch", "torchvision"}.isdisjoint(asked)
 
 

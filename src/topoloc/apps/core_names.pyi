@@ -36,7 +36,6 @@ from topoloc.mapping.certificate import (
 from topoloc.mapping.edit import edit_map as edit_map
 from topoloc.mapping.junctions import (
     WalkGraph as WalkGraph,
-    describe_junctions as describe_junctions,
 )
 from topoloc.mapping.nodes import NodePoses as NodePoses, node_distances as node_distances
 from topoloc.mapping.storage.entries import today as today

@@ -9,15 +9,16 @@ traversed in both directions.
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.spatial import KDTree
 
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
@@ -64,13 +65,14 @@ class WalkGraph:
     about a quarter of a reach apart, also between nodes, so that the crossing of two edges is found
     where it is. Place i is at `places[i]`: at its first node, if it has one. `reach` (metres) is
     the D_thresh of its map. Places within it are neighbours. Node k is at place `place_of[k]`.
+    `links[i]` holds the metres from place i to each of its neighbours.
     """
 
     nodes: Float[np.ndarray, "n 3"]
     place_of: Int[np.ndarray, " n"]
     places: Float[np.ndarray, "p 3"]
     reach: Float[np.ndarray, " p"]
-    metres: csr_array
+    links: list[dict[int, float]]
 
     @staticmethod
     def from_maps(maps: Iterable[tuple[TopoMetricMap, Rigid3]]) -> WalkGraph:
@@ -95,65 +97,105 @@ class WalkGraph:
         """Return the shortest route between two nodes, by their numbers, with the nodes nearest to
         it. Raises MapError: no walk connects them."""
         first, last = self.place_of[[start, end]].tolist()
-        metres, before = dijkstra(
-            self.metres, directed=False, indices=first, return_predecessors=True
-        )
-        if not np.isfinite(metres[last]):
+        metres, before = self._find_ways_from(first)
+        if math.isinf(metres[last]):
             raise MapError(
                 "no walk connects the two nodes; a recording from one to the other does"
                 " (topoloc update)"
             )
         path = [last]
         while path[-1] != first:
-            path.append(int(before[path[-1]]))
+            path.append(before[path[-1]])
         path.reverse()
-        nearest = np.atleast_1d(KDTree(self.nodes).query(self.places[path])[1])
         offsets = np.linalg.norm(self.nodes[[start, end]] - self.places[[first, last]], axis=1)
         nodes, along = [start], [0.0]
-        for place, node in zip(path, nearest.tolist(), strict=True):
-            if node not in (start, end, nodes[-1]):
+        for place in path:
+            if (node := self.nearest_node(self.places[place])) not in (start, end, nodes[-1]):
                 nodes.append(node)
                 along.append(float(offsets[0] + metres[place]))
         return Route([*nodes, end], [*along, float(offsets.sum() + metres[last])])
 
     def find_junctions(self) -> list[Junction]:
         """Return the junctions, in the order of their nodes."""
-        tree = KDTree(self.places)
-        found = [self._find_ways(tree, place) for place in range(len(self.places))]
-        rows = np.flatnonzero([len(ends) > 2 for ends in found])
-        count, labels = connected_components(self.metres[rows][:, rows], directed=False)
+        grid = _Grid(self.places, _OUTER * float(self.reach.max()))
+        found = [self._find_ways(grid, place) for place in range(len(self.places))]
         junctions = list[Junction]()
-        for label in range(count):
-            members = rows[labels == label]
+        for part in self._find_parts(row for row, ends in enumerate(found) if len(ends) > 2):
+            members = np.array(part)
             offsets = np.linalg.norm(self.places[members] - self.places[members].mean(0), axis=1)
-            num_ways = np.array([len(found[row]) for row in members])
-            chosen = members[np.lexsort((offsets, -num_ways))[0]]
+            num_ways = np.array([len(found[row]) for row in part])
+            chosen = part[int(np.lexsort((offsets, -num_ways))[0])]
             # The sum of the distances to the ends of its branches is least at the junction.
-            sums = dijkstra(self.metres, directed=False, indices=found[chosen]).sum(axis=0)
+            sums = np.sum([self._find_ways_from(end)[0] for end in found[chosen]], axis=0)
             position = self.places[members[sums[members].argmin()]]
             junctions.append(Junction(self.nearest_node(position), position, int(num_ways.max())))
         return sorted(junctions, key=lambda junction: junction.node)
 
-    def _find_ways(self, tree: KDTree, place: int) -> list[int]:
+    def _find_ways(self, grid: _Grid, place: int) -> list[int]:
         """Return a far place on each of the directions of travel that lead away from a place."""
-        reach, centre = self.reach[place], self.places[place]
-        near = np.array(tree.query_ball_point(centre, _OUTER * reach), np.int64)
-        metres = np.linalg.norm(self.places[near] - centre, axis=1)
-        is_ring = metres > _INNER * reach
-        directions = (self.places[near] - centre) / np.maximum(metres, 1e-12)[:, None]
+        reach, centre = float(self.reach[place]), self.places[place]
+        near = grid.find_near(centre, _OUTER * reach)
+        offsets = self.places[near] - centre
+        metres = np.linalg.norm(offsets, axis=1)
+        directions = offsets / np.maximum(metres, 1e-12)[:, None]
         if len(_separate(directions[metres > (_OUTER - 1) * reach])) < 3:
             return []
-        links = self.metres[near][:, near]
-        _, parts = connected_components(links, directed=False)
-        is_ring &= parts == parts[metres.argmin()]
-        ring = np.flatnonzero(is_ring)
-        _, arms = connected_components(links[ring][:, ring], directed=False)
+        metres_of = dict(zip(near, metres.tolist(), strict=True))
+        here = next(part for part in self._find_parts(near) if place in part)
         ends = list[int]()
-        for arm in np.unique(arms):
-            members = ring[arms == arm]
-            if metres[members].max() > (_OUTER - 0.5) * reach:
-                ends.append(int(members[metres[members].argmax()]))
-        return near[[ends[k] for k in _separate(directions[ends])]].tolist()
+        for arm in self._find_parts(row for row in here if metres_of[row] > _INNER * reach):
+            end = max(arm, key=lambda row: metres_of[row])
+            if metres_of[end] > (_OUTER - 0.5) * reach:
+                ends.append(end)
+        away = self.places[ends] - centre
+        return [ends[k] for k in _separate(away / np.linalg.norm(away, axis=1)[:, None])]
+
+    def _find_ways_from(self, start: int) -> tuple[list[float], list[int]]:
+        """Return the metres from a place to each one, infinite without a way, and the place before
+        each one (Dijkstra)."""
+        metres, before = [math.inf] * len(self.places), [start] * len(self.places)
+        metres[start], queue = 0.0, [(0.0, start)]
+        while queue:
+            so_far, place = heappop(queue)
+            if so_far > metres[place]:
+                continue
+            for other, step in self.links[place].items():
+                if so_far + step < metres[other]:
+                    metres[other], before[other] = so_far + step, place
+                    heappush(queue, (metres[other], other))
+        return metres, before
+
+    def _find_parts(self, places: Iterable[int]) -> list[list[int]]:
+        """Return the parts of some places that are linked."""
+        left, parts = dict.fromkeys(places), list[list[int]]()
+        while left:
+            part = [left.popitem()[0]]
+            for place in part:
+                linked = [other for other in self.links[place] if other in left]
+                for other in linked:
+                    del left[other]
+                part += linked
+            parts.append(sorted(part))
+        return parts
+
+
+class _Grid:
+    """Find points within a distance, up to the side of a cell (metres)."""
+
+    def __init__(self, points: Float[np.ndarray, "p 3"], side: float) -> None:
+        self._points, self._side = points, side
+        self._rows: dict[tuple[int, ...], list[int]] = defaultdict(list)
+        for row, cell in enumerate(np.floor(points / side).astype(np.int64).tolist()):
+            self._rows[tuple(cell)].append(row)
+
+    def find_near(self, centre: Float[np.ndarray, "3"], metres: float) -> list[int]:
+        """Return the rows of the points within a distance of a position, in order."""
+        cell, rows = np.floor(centre / self._side).astype(np.int64).tolist(), list[int]()
+        for steps in product((-1, 0, 1), repeat=3):
+            rows += self._rows.get(tuple(map(sum, zip(cell, steps, strict=True))), ())
+        rows.sort()
+        is_near = np.linalg.norm(self._points[rows] - centre, axis=1) <= metres
+        return np.array(rows, np.int64)[is_near].tolist()
 
 
 def describe_junctions(topomap: TopoMetricMap) -> list[dict[str, Any]]:
@@ -210,13 +252,13 @@ def _join_places(
     places, reach = points[chosen], reach[chosen]
     walked = place_of[len(nodes) :]
     walked = np.column_stack([walked[:-1], walked[1:]])[edge[:-1] == edge[1:]]
-    near = KDTree(places).query_pairs(reach.max(), output_type="ndarray")
-    limits = reach[near].max(axis=1)
-    near = near[np.linalg.norm(places[near[:, 1]] - places[near[:, 0]], axis=1) <= limits]
-    pairs = np.unique(np.sort(np.concatenate([walked, near]), axis=1), axis=0)
-    one, other = pairs[pairs[:, 0] < pairs[:, 1]].T
-    metres = np.linalg.norm(places[other] - places[one], axis=1)
-    size = (len(places), len(places))
-    return WalkGraph(
-        nodes, place_of[: len(nodes)], places, reach, csr_array((metres, (one, other)), shape=size)
-    )
+    links: list[dict[int, float]] = [{} for _ in places]
+    for one, other in walked.tolist():
+        if one != other:
+            links[one][other] = links[other][one] = math.dist(places[one], places[other])
+    grid = _Grid(places, float(reach.max()))
+    for one, centre in enumerate(places):
+        for other in grid.find_near(centre, float(reach[one])):
+            if one != other:
+                links[one][other] = links[other][one] = math.dist(centre, places[other])
+    return WalkGraph(nodes, place_of[: len(nodes)], places, reach, links)

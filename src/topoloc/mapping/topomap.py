@@ -150,7 +150,6 @@ class TopoMetricMap:
     def describe(self, path: str | Path) -> dict[str, Any]:
         """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,
         junctions, sessions, edits, configuration. Raises EmptyMapError: the map has no node."""
-        from topoloc.mapping.junctions import describe_junctions
         from topoloc.mapping.storage.map_reading import list_coarse_models
 
         path = Path(path)
@@ -171,7 +170,7 @@ class TopoMetricMap:
             "num_side_nodes": len(self.sides.summaries) if self.sides else 0,
             "num_place_images": len(self.place_images),
             "length_m": round(self.length_m, 3),
-            "junctions": describe_junctions(self),
+            "junctions": self.junctions,
             "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
             "recordings": sorted({s.recording for s in self.summaries}),
             "sessions": [
@@ -191,6 +190,13 @@ class TopoMetricMap:
             "coarse_models": models,
             "config": self.config.to_json(),
         }
+
+    @cached_property
+    def junctions(self) -> list[dict[str, Any]]:
+        """Return the junctions of the map as JSON (`describe_junctions`)."""
+        from topoloc.mapping.junctions import describe_junctions
+
+        return describe_junctions(self)
 
     def describe_certificate(self) -> dict[str, Any] | None:
         """Return the certificate as JSON, with its promise and whether the map was edited since."""

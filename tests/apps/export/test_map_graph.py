@@ -13,7 +13,6 @@ import numpy as np
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.apps.cli.maps.info import build_graph
-from topoloc.apps.core_names import describe_junctions
 
 NS = {"g": "http://graphml.graphdrawing.org/xmlns"}
 
@@ -37,7 +36,7 @@ def test_the_graph_is_that_of_the_map(room_map: Path):
                 < 1e-12
             )
             assert facts["times"] >= 1
-        junctions = {one["node"] for one in describe_junctions(topomap)}
+        junctions = {one["node"] for one in topomap.junctions}
     assert {node for node, facts in graph.nodes.items() if facts["is_junction"]} == junctions
 
 

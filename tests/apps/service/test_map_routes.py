@@ -16,7 +16,6 @@ from answers_compared import without_times
 from running_service import running
 
 from topoloc.apps.cli import main
-from topoloc.apps.core_names import describe_junctions
 from topoloc.localization.result import Localization, result_from_json
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.trajectory import Trajectory
@@ -122,7 +121,7 @@ def test_maps_are_described(client: httpx.Client, maps: Path):
     with TopoMetricMap.load(maps / "earth.topo") as topomap:
         assert described["num_nodes"] == len(described["nodes"]) == len(topomap.summaries)
         assert described["georeference"] == topomap.georeference.to_json()  # pyright: ignore[reportOptionalMemberAccess]
-        assert described["junctions"] == describe_junctions(topomap)
+        assert described["junctions"] == topomap.junctions
         assert [session["name"] for session in described["sessions"]] == [
             session.name for session in topomap.sessions
         ]

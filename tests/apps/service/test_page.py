@@ -256,7 +256,8 @@ def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):
 
 
 def test_a_live_stream_draws_the_path(lab: Lab, browser: Any):
-    """A canvas with the image replaces the browser's camera."""
+    """A canvas with the image replaces the browser's camera. A corner of it changes, as no image of
+    a camera equals the one before."""
     with opened(browser, f"{lab.service.url}/", 1300) as page:
         page.wait_for_selector("#scene canvas")
         page.evaluate(
@@ -265,7 +266,12 @@ def test_a_live_stream_draws_the_path(lab: Lab, browser: Any):
               image.src = `data:image/jpeg;base64,${base64}`;
               await image.decode();
               const canvas = Object.assign(document.createElement("canvas"), { width: image.width, height: image.height });
-              setInterval(() => canvas.getContext("2d").drawImage(image, 0, 0), 50);
+              const context = canvas.getContext("2d");
+              setInterval(() => {
+                context.drawImage(image, 0, 0);
+                context.fillStyle = `rgb(${Date.now() % 256}, 0, 0)`;
+                context.fillRect(0, 0, 8, 8);
+              }, 50);
               navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(20);
             }""",  # noqa: E501
             base64.b64encode(lab.picture.read_bytes()).decode(),

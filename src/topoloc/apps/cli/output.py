@@ -61,8 +61,8 @@ MaskOption = Annotated[
     option(
         "FILE",
         "none",
-        help="Mask of the images: a PNG that is black where they show what moves with the camera,"
-        " such as the robot's own body, and white elsewhere. Of their size, or scaled with it.",
+        help="Image that is black where the camera sees what moves with it (its robot),"
+        " and white elsewhere.",
     ),
 ]
 Topics = Annotated[

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from topoloc import Camera, Rigid3, TopoMetricMap, read_image
-from topoloc.apps import core_names
 from topoloc.apps.core_names import encode_jpeg
 from topoloc.apps.quality.certificate_texts import describe_group
 from topoloc.apps.viewer.map_scene import sample_node_colours, unique_image_names
@@ -76,7 +75,7 @@ def create_document(
             "rgb": to_base64(shown.rgb),
         },
         "nodes": _nodes_to_json(topomap, shown.cameras, images),
-        "junctions": core_names.describe_junctions(topomap),
+        "junctions": topomap.junctions,
         "paths": [*_mapped_paths(topomap), *result_paths(results)],
         "results": [results_to_json(one) for one in results if one.answers],
     }

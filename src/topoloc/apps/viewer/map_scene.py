@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from topoloc import MapError, TopoMetricMap, TopoNode
-from topoloc.apps import core_names
 from topoloc.apps.core_names import NodeMatcher
 from topoloc.apps.viewer.scene import Points, Progress, Scene, View
 
@@ -218,7 +217,7 @@ def create_map_scene(
     trajectory = [
         image.world_from_cam for image in topomap.place_images if is_shown(image.session_id)
     ]
-    junctions = core_names.describe_junctions(topomap) if session_id is None else ()
+    junctions = topomap.junctions if session_id is None else ()
     return Scene(name, views, points, trajectory, topomap.georeference, junctions)
 
 

@@ -72,7 +72,8 @@ def test_a_folder_is_replaced_whole_and_links_are_followed(room_map: Path, tmp_p
     assert main(["export", str(room_map), str(link)]) == 0
     assert link.is_symlink()
     first = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert set(first) == {"cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt"}
+    names = ("cameras", "images", "points3D", "rigs", "frames")
+    assert set(first) == {f"{name}{suffix}" for name in names for suffix in (".txt", ".bin")}
     (folder / "images.txt").write_text("of before")
     assert main(["export", str(room_map), str(folder)]) == 0
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == first

@@ -91,10 +91,10 @@ class Command:
     ] = None
     """Weight of rotation against translation (lambda of Eq. 1)."""
     look_alike_floors: Flag = False
-    """The building has floors like this one that are not mapped: poses need the same colours, and
-    those of a stream three places with them."""
+    """Floors like this one are not mapped: poses need the same colours, those of a stream three
+    places with them."""
     level: Flag = False
-    """Give the map a world with z up and the floor at z = 0, see `topoloc level`."""
+    """Turn z up and set the floor at z = 0, as `topoloc level`."""
     features: BUILD_FEATURES = None
     """Feature types of the map. `learned`: the first network of `topoloc weights list` that is
     installed. `both`: that and SURF."""

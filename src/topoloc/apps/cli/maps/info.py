@@ -23,7 +23,6 @@ from topoloc import (
     check_map,
     open_place,
 )
-from topoloc.apps import core_names
 from topoloc.apps.cli.maps.atlas import show_atlas
 from topoloc.apps.cli.output import (
     File,
@@ -172,7 +171,7 @@ def build_graph(topomap: TopoMetricMap) -> MapGraph:
     """Return the graph of a map. Traversals are counted from its place images."""
     poses = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
     out = Counter(edge.source_id for edge in topomap.edges)
-    junctions = {one["node"] for one in core_names.describe_junctions(topomap)}
+    junctions = {one["node"] for one in topomap.junctions}
     nodes: dict[int, dict[str, Any]] = {
         s.node_id: {
             "session": s.session_id,
