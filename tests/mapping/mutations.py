@@ -267,7 +267,7 @@ def _arrays(database: sqlite3.Connection, rng: Rng) -> str:
         lambda a: np.concatenate([a, a]),
         lambda a: a.astype(np.int64),
         lambda a: a.astype(np.float64) * 1e30,
-        lambda a: np.full_like(a, np.nan if a.dtype.kind == "f" else -5),
+        lambda a: np.full(a.shape, np.nan if a.dtype.kind == "f" else -5).astype(a.dtype),
         lambda a: a.reshape(-1),
         lambda a: np.zeros((0, *a.shape[1:]), a.dtype),
         lambda a: np.asfortranarray(a),
