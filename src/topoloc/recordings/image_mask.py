@@ -25,8 +25,6 @@ from topoloc.recordings.frame import (
     StereoSequence,
     to_grey,
 )
-from topoloc.recordings.image_io import read_image
-from topoloc.recordings.recording import read_left_frame
 
 Mask = Bool[np.ndarray, "mask_h mask_w"]
 _AnyCamera = TypeVar("_AnyCamera", bound=Camera | UncalibratedCamera)
@@ -39,6 +37,8 @@ def read_mask(path: str | Path) -> Mask:
         UnreadableImageError: the file is no image.
         CalibrationError: it leaves out every pixel.
     """
+    from topoloc.recordings.image_io import read_image  # queries without a mask read no file
+
     grey = to_grey(read_image(Path(path)))
     if grey.max() < 128:
         raise CalibrationError(
@@ -107,6 +107,8 @@ class _MaskedView(SequenceView):
 
     def read_left_frame(self, index: int) -> StereoFrame:
         """Read one frame without its right or depth image. Raises as `read_frame`."""
+        from topoloc.recordings.recording import read_left_frame
+
         frame = read_left_frame(self.base, self.indices[index])
         return self._mask_frame(replace(frame, world_from_cam=self.poses[index]))
 
