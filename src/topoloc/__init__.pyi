@@ -111,8 +111,15 @@ from topoloc.recordings.trajectory import (
     with_pose_conventions as with_pose_conventions,
     with_trajectory as with_trajectory,
 )
+from topoloc.rigs.rig import Rig as Rig, RigCamera as RigCamera, cut_panorama as cut_panorama
+from topoloc.rigs.rig_localizer import RigLocalizer as RigLocalizer
+from topoloc.rigs.rig_result import (
+    RigLocalization as RigLocalization,
+    RigNotLocalized as RigNotLocalized,
+)
 from topoloc.slam.slam import SlamResult as SlamResult, run_slam as run_slam
 from topoloc.tracking.config import TrackerConfig as TrackerConfig
+from topoloc.tracking.gyroscope import Gyroscope as Gyroscope
 from topoloc.tracking.shared_cameras import SharedCameras as SharedCameras
 from topoloc.tracking.stream_result import StreamedPose as StreamedPose
 from topoloc.tracking.tracker import Tracker as Tracker

@@ -50,6 +50,8 @@ class RouteConfig:
         turn_rate: approximate largest change of direction, radians a second. Motion slows down in
             bends.
         seed: another seed is another walk on the same line.
+        mounting: rows of the 3x4 matrix rig_from_cam of a camera on a rig, whose frame then moves
+            along the line.
     """
 
     laps: float = 1.0
@@ -67,6 +69,7 @@ class RouteConfig:
     corner_radius: float = 0.5
     turn_rate: float = float(np.radians(40.0))
     seed: int = 0
+    mounting: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         positive = {
@@ -230,7 +233,10 @@ def world_from_cam_at(route: Route, t: float) -> Rigid3:
     facing = heading + route.config.look
     c, s = np.cos(facing), np.sin(facing)
     level = np.array([[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]])
-    return Rigid3(level @ exp_so3(np.array([pitch, -yaw, roll])), centre)
+    world_from_rig = Rigid3(level @ exp_so3(np.array([pitch, -yaw, roll])), centre)
+    if route.config.mounting is None:
+        return world_from_rig
+    return world_from_rig @ Rigid3.from_json([list(row) for row in route.config.mounting])
 
 
 def velocity_at(route: Route, t: float, interval: float = 0.02) -> Float[np.ndarray, "3"]:

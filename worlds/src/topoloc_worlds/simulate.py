@@ -22,11 +22,13 @@ from topoloc.apps.cli.output import (
 from topoloc.errors import CalibrationError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.camera_files import read_camera_json
+from topoloc.recordings.trajectory import Trajectory
+from topoloc.rigs.rig import Rig
 from topoloc_worlds.conditions import find_condition
 from topoloc_worlds.demo_recordings import render_recordings
 from topoloc_worlds.recorder import ZED, RecordConfig, Recorded, record
 from topoloc_worlds.rendering.renderer import RenderConfig
-from topoloc_worlds.routes import RouteConfig
+from topoloc_worlds.routes import RouteConfig, frame_poses, plan_route
 from topoloc_worlds.worlds import World, find_world
 
 _MOMENTS_OF_BLUR = 5
@@ -83,6 +85,9 @@ class PictureOptions:
     """Metres between the left and the right camera."""
     mono: Flag = False
     """A single camera: pictures in images/, and a camera.json."""
+    rig: File = None
+    """A rig.json: one recording of single images for each camera, in the folder of its name, all
+    of the same walk. Cameras without a model take that of --camera."""
     depth: Flag = False
     """Exact depth pictures, too; with --mono this makes an RGB-D recording."""
     grey: Flag = False
@@ -142,13 +147,25 @@ class Command:
         return 0
 
     def _record(self) -> int:
-        world, condition, out = (
-            find_world(self.world),
-            find_condition(self.condition),
-            Path(self.out),
-        )
+        world, out = find_world(self.world), Path(self.out)
         config = self._config(world)
         check_outputs([self.json])
+        if self.picture.rig is None:
+            self._record_one(world, out, config)
+            return 0
+        rig = Rig.read(self.picture.rig)
+        for name, mounted in rig.cameras.items():
+            mounting = tuple(map(tuple, mounted.rig_from_cam.tolist()))
+            route = replace(config.route, mounting=mounting)
+            camera = config.camera if mounted.camera is None else mounted.camera
+            self._record_one(world, out / name, replace(config, route=route, camera=camera))
+        write_json(str(out / "rig.json"), rig.to_json())
+        route = plan_route(world.loop, world.camera_height, config.route)
+        Trajectory(frame_poses(route), route.t_ns).write_tum(out / "truth.tum")
+        return 0
+
+    def _record_one(self, world: World, out: Path, config: RecordConfig) -> None:
+        condition = find_condition(self.condition)
         began, done, total = time.monotonic(), 0, 0
 
         def count(stage: str, num_done: int, num: int) -> None:
@@ -171,12 +188,12 @@ class Command:
                 " there)"
             ) from stopped
         self._tell(out, recorded, time.monotonic() - began)
-        return 0
 
     def _config(self, world: World) -> RecordConfig:
         pictures = self.picture
-        if pictures.mono and pictures.baseline is not None:
-            raise UsageError("--mono has no --baseline")
+        is_mono = pictures.mono or pictures.rig is not None
+        if is_mono and pictures.baseline is not None:
+            raise UsageError("--mono and --rig have no --baseline")
         return RecordConfig(
             seed=self.seed,
             arrangement=self.arrangement,
@@ -184,7 +201,7 @@ class Command:
             camera=_camera(pictures),
             baseline=(
                 None
-                if pictures.mono
+                if is_mono
                 else world.baseline
                 if pictures.baseline is None
                 else pictures.baseline
@@ -217,7 +234,8 @@ class Command:
         if self.json != "-":
             kept = recorded.num_frames - recorded.num_rendered
             before = f" ({kept} of them were there)" if kept else ""
-            what = "single pictures" if self.picture.mono else "stereo pairs"
+            is_mono = self.picture.mono or self.picture.rig is not None
+            what = "single pictures" if is_mono else "stereo pairs"
             print(
                 f"{out}: {recorded.num_frames} {what}{before}, {recorded.length:.1f} m, in"
                 f" {seconds:.0f} s"

@@ -64,6 +64,7 @@ from topoloc.apps.cli.queries.query_answers import (
     summarize_stream,
     to_trajectory,
 )
+from topoloc.apps.cli.queries.rig_queries import localize_rigs, write_rig_answers
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.core_names import as_monocular, find_format, split_selection
 from topoloc.apps.formats.live import LiveSource, is_live
@@ -106,6 +107,9 @@ class Command:
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels,
     `map` for the map's camera, `unknown` to estimate it from all images of one size."""
     mask: MaskOption = None
+    rig: Annotated[str | None, option("FILE|equirectangular", "one camera")] = None
+    """A rig.json, if the inputs, folders with one recording for each camera, hold none.
+    `equirectangular`: inputs are panoramas of 360 x 180 degrees."""
     save_camera: File = None
     """Write the camera that is estimated from images without calibration to this file
     (camera.json)."""
@@ -146,6 +150,10 @@ class Command:
             tracking = with_option(tracking, "max_jump", self.streams.max_jump, "--max-jump")
             tracking = replace(tracking, mode="paper")
         localizer, camera = self._open_localizer(settings, near), None
+        if self._is_rig:
+            rigs = localize_rigs(localizer, self.inputs, self.rig, self.json)
+            write_rig_answers(rigs, self.json, self.tum)
+            return 0
         if self.camera is not None and not self._stereo_calibration:
             camera = parse_camera(localizer, self.camera)
         if live and len(self.inputs) > 1:
@@ -208,6 +216,8 @@ class Command:
     def _check_usage(self, live: str | None) -> None:
         if self.streams.stream and self.streams.single:
             raise UsageError("--stream and --single exclude each other")
+        if self._is_rig and (live or self.camera or self.streams != StreamOptions()):
+            raise UsageError("--rig takes no --camera, live camera or options of streams")
         if self.streams.odometry is not None and (len(self.inputs) > 1 or live):
             raise UsageError("--odometry needs one recorded stream as the only input")
 
@@ -234,6 +244,11 @@ class Command:
             )
         ]
         return _Query(path, frames, is_stream)
+
+    @property
+    def _is_rig(self) -> bool:
+        """Return whether the inputs are images of rigs."""
+        return self.rig is not None or any(Path(path, "rig.json").is_file() for path in self.inputs)
 
     @property
     def _stereo_calibration(self) -> str | None:

@@ -1,0 +1,212 @@
+"""Recordings of several cameras of one body: a folder with ``rig.json`` and one recording for each
+camera in the folder of its name, and panoramas of 360 x 180 degrees.
+
+Images of one instant have one name. Poses are those of the cameras' recordings, or those of the rig
+(`truth.tum` or `poses.txt` beside rig.json). Each image is a frame of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+from topoloc import (
+    Image,
+    RecordingError,
+    Rig,
+    Rigid3,
+    StereoFrame,
+    StereoSequence,
+    cut_panorama,
+    open_sequence,
+)
+from topoloc.apps.core_names import as_monocular
+from topoloc.plugin import (
+    IndexedFrames,
+    RecordingFormat,
+    natural_key,
+    read_ground_truth,
+    times_from_rate,
+)
+
+EXPECTED_FILES = "rig.json, and a recording in the folder of each camera's name"
+_POSE_FILES = ("truth.tum", "poses.tum", "poses.txt")
+
+
+@dataclass(frozen=True, eq=False)
+class RigWalk:
+    """Hold the recordings of a rig's cameras, and the name and time of each instant."""
+
+    folder: Path
+    rig: Rig
+    walks: dict[str, StereoSequence]
+    rows: dict[str, dict[str, int]]
+    names: list[str]
+    t_ns: list[int]
+
+    @staticmethod
+    def open(folder: Path, rig_file: Path) -> RigWalk:
+        """Open the recordings of the cameras that have one.
+
+        Cameras without a model in the file of the rig take that of their recording.
+
+        Raises:
+            RecordingError: no camera has a recording, one cannot be read, or names differ.
+            CalibrationError: the file of the rig has another content.
+        """
+        rig = Rig.read(rig_file)
+        found = [name for name in rig.cameras if (folder / name).exists()]
+        if not found:
+            raise RecordingError(
+                f"{folder}: no folder is named as a camera of {rig_file} ({', '.join(rig.cameras)})"
+            )
+        walks = {name: as_monocular(open_sequence(folder / name)) for name in found}
+        cameras = {
+            name: replace(one, camera=walks[name][0].camera)
+            if one.camera is None and name in walks
+            else one
+            for name, one in rig.cameras.items()
+        }
+        rows = {name: {own: k for k, own in enumerate(w.names)} for name, w in walks.items()}
+        _check_names(folder, rows)
+        times = dict[str, int]()
+        for walk in reversed(walks.values()):
+            times |= zip(walk.names, walk.t_ns, strict=True)
+        names = sorted(times, key=natural_key)
+        t_ns = [times[name] for name in names]
+        if any(after <= before for before, after in pairwise(t_ns)):  # numbers of photos, no times
+            t_ns = times_from_rate(len(names), 1)
+        return RigWalk(folder, Rig(cameras), walks, rows, names, t_ns)
+
+    def read_images(self, name: str) -> dict[str, Image]:
+        """Return the images of an instant by the names of their cameras. Raises
+        UnreadableImageError."""
+        return {
+            camera: self.walks[camera][own[name]].image
+            for camera, own in self.rows.items()
+            if name in own
+        }
+
+
+def _check_names(folder: Path, rows: dict[str, dict[str, int]]) -> None:
+    """Raise RecordingError if the images of a camera have names of their own."""
+    for name, own in rows.items():
+        others = [other for camera, of in rows.items() if camera != name for other in of]
+        if others and own.keys().isdisjoint(others):
+            raise RecordingError(
+                f"{folder}: no image of {name} ({min(own)}, ...) has the name of one of another"
+                f" camera ({min(others)}, ...); name the images of one instant alike"
+            )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RigRecording(IndexedFrames):
+    """A StereoSequence of all images of a rig. `places` are camera and row of each frame."""
+
+    walk: RigWalk
+    places: list[tuple[str, int]]
+    names: list[str]
+    t_ns: list[int]
+    poses: list[Rigid3 | None]
+
+    @property
+    def name(self) -> str:
+        """Return the name of the folder."""
+        return self.walk.folder.name
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one image. Raises UnreadableImageError."""
+        camera, own = self.places[row]
+        frame = self.walk.walks[camera][own]
+        return replace(
+            frame,
+            name=self.names[row],
+            t_ns=self.t_ns[row],
+            camera=self.walk.rig.cameras[camera].camera,
+            world_from_cam=self.poses[row],
+        )
+
+
+def open_rig(path: Path) -> RigRecording:
+    """Open a folder. Raises as `RigWalk.open`; TrajectoryError: the poses are malformed."""
+    walk = RigWalk.open(path, path / "rig.json")
+    files = [path / name for name in _POSE_FILES]
+    of_rig = read_ground_truth(files[0], files[1:], walk.t_ns, walk.names)
+    places, names, times = list[tuple[str, int]](), list[str](), list[int]()
+    poses = list[Rigid3 | None]()
+    for instant, t_ns, world_from_rig in zip(walk.names, walk.t_ns, of_rig, strict=True):
+        for k, (camera, rows) in enumerate(walk.rows.items()):
+            if instant not in rows:
+                continue
+            pose = walk.walks[camera].poses[rows[instant]]
+            if world_from_rig is not None:
+                pose = world_from_rig @ walk.rig.cameras[camera].rig_from_cam
+            places.append((camera, rows[instant]))
+            names.append(f"{camera}/{instant}")
+            times.append(t_ns + k)
+            poses.append(pose)
+    return RigRecording(walk, places, names, times, poses)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PanoramaRecording(IndexedFrames):
+    """A StereoSequence of the views of panoramas, whose poses have z to the centre of the image."""
+
+    panoramas: StereoSequence
+    views: list[str]
+
+    @property
+    def name(self) -> str:
+        """Return the name of the folder."""
+        return self.panoramas.name
+
+    @property
+    def names(self) -> list[str]:
+        """Return image and view of each frame."""
+        return [f"{view}/{name}" for name in self.panoramas.names for view in self.views]
+
+    @property
+    def t_ns(self) -> list[int]:
+        """Return the time of each frame; the views of a panorama differ by a nanosecond."""
+        return [t + k for t in self.panoramas.t_ns for k in range(len(self.views))]
+
+    @property
+    def poses(self) -> list[Rigid3 | None]:
+        """Return the pose of each view."""
+        rig, _ = cut_panorama(self.panoramas[0].image)
+        turns = [rig.cameras[view].rig_from_cam for view in self.views]
+        return [None if one is None else one @ by for one in self.panoramas.poses for by in turns]
+
+    def __len__(self) -> int:
+        return len(self.panoramas) * len(self.views)
+
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one view. Raises UnreadableImageError, QueryError: no panorama."""
+        instant, k = divmod(row, len(self.views))
+        frame, view = self.panoramas[instant], self.views[k]
+        rig, images = cut_panorama(frame.image)
+        mounted, pose = rig.cameras[view], frame.world_from_cam
+        return StereoFrame(
+            f"{view}/{frame.name}",
+            frame.t_ns + k,
+            images[view],
+            mounted.camera,
+            world_from_cam=None if pose is None else pose @ mounted.rig_from_cam,
+        )
+
+
+def open_panoramas(path: Path) -> PanoramaRecording:
+    """Open a folder of equirectangular images. Raises RecordingError: it cannot be read."""
+    panoramas = as_monocular(open_sequence(path))
+    rig, _ = cut_panorama(panoramas[0].image)
+    return PanoramaRecording(panoramas, list(rig.cameras))
+
+
+FORMAT = RecordingFormat(EXPECTED_FILES, lambda path: (path / "rig.json").is_file(), open_rig)
+PANORAMAS = RecordingFormat(
+    "panoramas of 360 x 180 degrees (--format equirectangular)", lambda path: False, open_panoramas
+)

@@ -1,0 +1,1 @@
+"""Localize the images that several cameras of one body took at one instant."""

@@ -1,0 +1,131 @@
+"""Model a rig: cameras that are fixed on one body, and its file `rig.json`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from msgspec import Struct
+
+from topoloc.errors import CalibrationError, QueryError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.json_data import OneLine, decode_json
+from topoloc.recordings.camera_files import read_camera_json
+from topoloc.recordings.text_files import read_text
+
+
+@dataclass(frozen=True, repr=False)
+class RigCamera(OneLine):
+    """Hold the mounting of a camera (metres) and its model, None: not calibrated."""
+
+    rig_from_cam: Rigid3
+    camera: Camera | None = None
+
+
+@dataclass(frozen=True, repr=False)
+class Rig(OneLine):
+    """Hold the cameras of a rig by name.
+
+    The frame of the rig is any that is fixed to its body, such as that of one camera.
+    """
+
+    cameras: Mapping[str, RigCamera]
+
+    def __post_init__(self) -> None:
+        """Raise CalibrationError if there is no camera."""
+        if not self.cameras:
+            raise CalibrationError("a rig needs at least one camera")
+
+    @staticmethod
+    def read(path: str | Path) -> Rig:
+        """Read a rig.json: ``{"cameras": {"front": {"rig_from_cam": ..., "camera": ...}, ...}}``.
+
+        A mounting is `rig_from_cam` or `cam_from_rig`: rows of a 3x4 or 4x4 matrix, or translation
+        (metres) and quat_wxyz. `camera` is the content of a camera.json, or the path of one from
+        here; without it the camera is not calibrated.
+
+        Raises:
+            CalibrationError: the file is missing or has another content.
+        """
+        path = Path(path)
+        text = read_text(path, CalibrationError, "no such rig file")
+        data = decode_json(text, _RigFile, CalibrationError, str(path))
+        with CalibrationError.at(path):
+            cameras = {name: one.mounted(name, path.parent) for name, one in data.cameras.items()}
+            return Rig(cameras)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of a rig.json."""
+        return {
+            "cameras": {
+                name: {"rig_from_cam": one.rig_from_cam.to_json()}
+                | ({} if one.camera is None else {"camera": one.camera.to_json()})
+                for name, one in self.cameras.items()
+            }
+        }
+
+
+class _MountedCamera(Struct, frozen=True, forbid_unknown_fields=True):
+    rig_from_cam: Rigid3 | None = None
+    cam_from_rig: Rigid3 | None = None
+    camera: dict[str, Any] | str | None = None
+
+    def mounted(self, name: str, folder: Path) -> RigCamera:
+        """Raises CalibrationError: no mounting or two, or the camera's model cannot be read."""
+        if (self.rig_from_cam is None) == (self.cam_from_rig is None):
+            raise CalibrationError(f"{name}: a camera has either rig_from_cam or cam_from_rig")
+        mounting = self.rig_from_cam
+        if mounting is None:
+            assert self.cam_from_rig is not None
+            mounting = self.cam_from_rig.inverse()
+        if isinstance(self.camera, str):
+            return RigCamera(mounting, read_camera_json(folder / self.camera).camera)
+        if self.camera is None:
+            return RigCamera(mounting)
+        return RigCamera(mounting, Camera.from_json(self.camera, name))
+
+
+class _RigFile(Struct, frozen=True, forbid_unknown_fields=True):
+    cameras: dict[str, _MountedCamera]
+
+
+def cut_panorama(
+    panorama: UInt8[np.ndarray, "h w *channels"],
+) -> tuple[Rig, dict[str, UInt8[np.ndarray, "side side *channels"]]]:
+    """Return an equirectangular panorama (360 x 180 degrees) as a rig of four pinholes without
+    baseline, and their images of 90 degrees.
+
+    The rig's axes are those of COLMAP's EQUIRECTANGULAR camera: z to the centre of the image, x to
+    the right, y down.
+
+    Raises:
+        QueryError: the image is not twice as wide as high.
+    """
+    height, width = panorama.shape[:2]
+    if abs(width - 2 * height) > 2:
+        raise QueryError(
+            f"a panorama of 360 x 180 degrees is twice as wide as high, not {width}x{height}"
+        )
+    side = round(width / math.pi)  # the pixels of its centre have the size of the panorama's
+    camera = Camera.pinhole(side, side, side / 2, side / 2, (side - 1) / 2, (side - 1) / 2)
+    names = ("ahead", "right", "behind", "left")
+    turns = {name: exp_so3(np.array([0.0, k * math.pi / 2, 0.0])) for k, name in enumerate(names)}
+    rows, columns = np.indices((side, side))
+    rays_cam = camera.rays_from_img(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
+    wide = cv2.copyMakeBorder(panorama, 0, 0, 2, 2, cv2.BORDER_WRAP)
+    images = dict[str, np.ndarray]()
+    for name, rotation in turns.items():
+        x, y, z = (rays_cam @ rotation.T).T
+        column = (np.arctan2(x, z) / (2 * math.pi) + 0.5) * width + 1.5
+        row = (np.arctan2(y, np.hypot(x, z)) / math.pi + 0.5) * height - 0.5
+        column, row = (one.astype(np.float32).reshape(side, side) for one in (column, row))
+        images[name] = cv2.remap(wide, column, row, cv2.INTER_LINEAR)
+    centre = np.zeros(3)
+    return Rig({name: RigCamera(Rigid3(r, centre), camera) for name, r in turns.items()}), images
