@@ -13,7 +13,7 @@ import tiny_world
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import MemorySequence, StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import as_monocular, with_poses
 from topoloc.slam.image_tracks import match_images
@@ -87,6 +87,29 @@ def test_approximate_poses_of_images_are_corrected_and_said(photos: StereoSequen
         for one in (poses, found)
     ]
     assert turns[1] < 0.8 * turns[0]
+
+
+def test_photos_that_share_too_little_are_counted_and_named(photos: StereoSequence):
+    said, last = list[str](), photos[-1]
+    away = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, -40.0]))
+    blank = [
+        replace(
+            last,
+            name=f"blank{k}.png",
+            t_ns=last.t_ns + k,
+            image=np.full_like(last.image, 128),
+            world_from_cam=Rigid3(away.rotation, away.translation + k),
+        )
+        for k in (1, 2)
+    ]
+    frames = [photos[k] for k in range(len(photos))]
+    frames = [replace(frame, right=None, rig=None) for frame in (*frames, *blank)]
+    found = correct_poses(MemorySequence(frames, "walk"), said.append)
+    assert said == [
+        "walk: 2 of 14 pictures share too little with the others, so their poses are not checked:"
+        " blank1.png, blank2.png; take more between them and the others"
+    ]
+    assert all(pose is not None for pose in found.poses)
 
 
 def test_few_photos_and_equal_poses_are_left_as_they_are(photos: StereoSequence):

@@ -28,12 +28,16 @@ FORMATS = {
     "stray_scanner": "topoloc.apps.formats.stray_scanner:FORMAT",
     "record3d": "topoloc.apps.formats.record3d:FORMAT",
     "colmap": "topoloc.apps.formats.colmap:FORMAT",
+    "opensfm": "topoloc.apps.formats.opensfm:FORMAT",
+    "kapture": "topoloc.apps.formats.kapture:FORMAT",
     "colmap_database": "topoloc.apps.formats.colmap_database:FORMAT",
     "kitti": "topoloc.apps.formats.kitti:FORMAT",
     "rosbag": "topoloc.apps.formats.bags.bag_recording:ROSBAG_FORMAT",
     "mcap": "topoloc.apps.formats.bags.bag_recording:MCAP_FORMAT",
     "zed": "topoloc.apps.formats.zed:FORMAT",
     "video": "topoloc.apps.formats.video:FORMAT",
+    "rig": "topoloc.apps.formats.rig:FORMAT",
+    "equirectangular": "topoloc.apps.formats.rig:PANORAMAS",
     "folder": "topoloc.recordings.folder:FORMAT",
 }
 

@@ -50,36 +50,33 @@ _NUM_FOLDS = 4
 
 def correct_poses(sequence: StereoSequence, warn: Callable[[str], object]) -> StereoSequence:
     """Return a recording of single images with corrected poses (world_from_cam), in the world of
-    the given ones. Wrong ones are None. Others than 8 to 600 single images are returned as they
-    are. `warn` is called with each finding, a wrong focal length, too, with which no pose is
-    corrected. Raises RecordingError, CalibrationError, UnreadableImageError: a frame cannot be
-    read."""
+    the given ones. Wrong ones are None. Others than 8 to 600 single images stay as they are. `warn`
+    is called with each finding, a wrong focal length, too, with which no pose is corrected. Raises
+    RecordingError, CalibrationError, UnreadableImageError: a frame cannot be read."""
     posed: dict[int, Rigid3 | None] = {
         k: pose for k, pose in enumerate(sequence.poses) if pose is not None
     }
     if not _MIN_IMAGES <= len(posed) <= _MAX_IMAGES:
         return sequence
     first = sequence[next(iter(posed))]
-    if (
-        not has_scale(sequence)
-        or first.camera is None
-        or first.right is not None
-        or first.depth is not None
-    ):
+    is_single = first.right is None and first.depth is None
+    if first.camera is None or not (is_single and has_scale(sequence)):
         return sequence
     rows, poses = list(posed), [pose for pose in sequence.poses if pose is not None]
     images = extract_images(sequence, rows)
     pairs, shares = match_images(images, poses, 4, _MAX_ERROR * first.camera.fx)
-    of_doubtful = match_all(
-        images, [k for k in np.argsort(shares)[:6].tolist() if shares[k] <= 0.5]
-    )
+    doubtful = [k for k in np.argsort(shares)[:6].tolist() if shares[k] <= 0.5]
+    of_doubtful = match_all(images, doubtful)
+    names = [sequence.names[row] for row in rows]
+    for text in _describe_alone(sequence.name, names, pairs + of_doubtful):
+        warn(text)
     network = _Network(images, join_tracks(images, pairs + of_doubtful), poses)
     wrong = network.find_wrong_poses(pairs + of_doubtful)
     errors = np.array([_error_px(images, pair, poses) for pair in pairs])
     for k, error in wrong.items():
         posed[rows[k]] = None
         warn(
-            f"{sequence.name}: the pose of {sequence.names[rows[k]]} is wrong: points of the"
+            f"{sequence.name}: the pose of {names[k]} is wrong: points of the"
             f" other pictures are {error:.0f} px off in it; it is left out"
         )
     is_kept = np.array([not wrong.keys() & {one.first, one.second} for one in pairs], bool)
@@ -96,6 +93,21 @@ def correct_poses(sequence: StereoSequence, warn: Callable[[str], object]) -> St
             warn(f"{sequence.name}: {_describe_changes(some[1], found, contradiction)}")
             posed.update(zip((rows[k] for k in kept), found, strict=True))
     return with_poses(sequence, [posed.get(k) for k in range(len(sequence))])
+
+
+def _describe_alone(
+    recording: str, names: Sequence[str], pairs: Sequence[ImagePair]
+) -> Sequence[str]:
+    """Return a text if images have no pair and others have."""
+    seen = {k for one in pairs for k in (one.first, one.second)}
+    alone = [name for k, name in enumerate(names) if k not in seen]
+    if not seen or not alone:
+        return ()
+    return (
+        f"{recording}: {len(alone)} of {len(names)} pictures share too little with the others, so"
+        f" their poses are not checked: {', '.join(alone[:5])}{' ...' * (len(alone) > 5)}; take"
+        " more between them and the others",
+    )
 
 
 def _describe_focal(name: str, fits: float, given: float) -> str:

@@ -197,6 +197,22 @@ def test_viewing_angles_of_blender(
     assert len(open_sequence(folder / "transforms_train.json")) == 3
 
 
+@pytest.mark.parametrize(
+    "base", ["./data/capture/images", "/home/me/scan/images", "C:\\scans\\images", "../../images"]
+)
+def test_images_beside_the_file_whatever_its_base_was(capture: Make, base: str):
+    def change(data: dict[str, Any]) -> None:
+        for frame in data["frames"]:
+            frame["file_path"] = f"{base}/{frame['file_path'].rpartition('/')[2]}"
+
+    said = list[str]()
+    sequence = open_sequence(capture(change, depth_scale=None), warn=said.append)
+    assert sequence.names == ["images/frame_1.png", "images/frame_2.png", "images/frame_10.png"]
+    assert_same_pose(sequence[2].world_from_cam, pose(10))
+    assert len(said) == 1
+    assert "transforms.json: 3 images are elsewhere: images/frame_1.png, not" in said[0]
+
+
 @pytest.mark.parametrize("suffix", ["", ".png"])
 def test_names_that_a_mac_has_decomposed(capture: Make, suffix: str):
     def change(data: dict[str, Any]) -> None:

@@ -43,8 +43,8 @@ Format = Annotated[
         "NAME",
         "recognised",
         help="Format of the recordings: kitti, euroc, tum, seven_scenes, scannet,"
-        " arkitscenes, nerfstudio, stray_scanner, record3d, colmap, colmap_database, rosbag, mcap,"
-        " zed, video or folder.",
+        " arkitscenes, nerfstudio, stray_scanner, record3d, colmap, opensfm, kapture,"
+        " colmap_database, rosbag, mcap, zed, video, rig, equirectangular or folder.",
     ),
 ]
 CameraOption = Annotated[

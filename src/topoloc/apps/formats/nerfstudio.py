@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from pathlib import Path, PurePath
@@ -80,24 +82,25 @@ def open_nerfstudio(path: Path, calibration: CalibrationForSize | None = None) -
         for k, frame in enumerate(whole.frames)
     ]
     named = [
-        (parse_relative_path(frame.file_path, f"{file}, frame {k}", RecordingError), frame, lens)
+        (_find_image(file.parent, frame.file_path, f"{file}, frame {k}"), frame, lens)
         for k, (frame, lens) in enumerate(zip(read, whole.frames, strict=True))
     ]
     named.sort(key=lambda pair: natural_key(pair[0]))
-    names = [_with_suffix(file.parent, name) for name, _, _ in named]
+    names = [name for name, _, _ in named]
     where, frames = [f"{file}, {name}" for name in names], [frame for _, frame, _ in named]
     poses: list[Rigid3 | None] = [_pose(frame, whole.applied_scale) for frame in frames]
     depth = _depth(frames, whole.integer_depth_scale or whole.depth_unit_scale_factor, file, where)
     place = file.parent.resolve().name, file.parent, names, times_from_rate(len(names)), poses
+    notes = _describe_moved(file, [frame.file_path for frame in frames], names)
     if calibration is not None:
-        return with_calibration(Recording(*place, None, depth=depth), calibration)
+        return with_calibration(Recording(*place, None, depth=depth, notes=notes), calibration)
     size = cache(lambda: first_image_size([file.parent / name for name in names]))
     # Keys of the file take precedence, as in nerfstudio.
     cameras = [
         _camera(_with_defaults(lens | data, size, at), at)
         for (_, _, lens), at in zip(named, where, strict=True)
     ]
-    return Recording.with_cameras(*place, cameras, depth=depth)
+    return replace(Recording.with_cameras(*place, cameras, depth=depth), notes=notes)
 
 
 _Factor = Annotated[float, Meta(gt=1e-12, lt=1e12)]
@@ -214,15 +217,29 @@ def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> D
     return DepthImages(paths, 1.0 / unit, None, Rigid3.identity())
 
 
-def _with_suffix(folder: Path, name: str) -> str:
-    """Add the suffix of the file, which Blender's scenes omit. If the path begins in another
-    folder, its longest end that exists counts."""
-    parts = PurePath(name).parts
-    for start, suffix in product(range(len(parts)), _SUFFIXES):
-        end = PurePath(*parts[start:]).as_posix()
+def _find_image(folder: Path, given: str, where: str) -> str:
+    """Return the path of an image below the folder, with the suffix of the file, which Blender's
+    scenes omit. Of a path that begins in another folder the longest end that exists counts."""
+    parts = [part for part in re.split(r"[\\/]+", given) if part not in ("", ".", "..")]
+    for start, suffix in product(range(0 if "\0" in given else len(parts)), _SUFFIXES):
+        end = "/".join(parts[start:])
         if os.path.exists(find_path(folder / f"{end}{suffix}")):
             return f"{end}{suffix}"
+    name = parse_relative_path(given, where, RecordingError)
     return name if PurePath(name).suffix else f"{name}.png"
+
+
+def _describe_moved(file: Path, given: list[str], names: list[str]) -> tuple[str, ...]:
+    """Return a note if images are not where the file says."""
+    moved = [
+        (said, name)
+        for said, name in zip(given, names, strict=True)
+        if len(PurePath(said.replace("\\", "/")).parts) > len(PurePath(name).parts)
+    ]
+    if not moved:
+        return ()
+    said, name = moved[0]
+    return (f"{file}: {len(moved)} images are elsewhere: {name}, not {said[:120]!r}",)
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_nerfstudio, ("calibration",))
