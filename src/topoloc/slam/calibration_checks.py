@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float
@@ -22,7 +23,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import camera_from_intrinsics
 from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.depth_checks import find_depth_shift, find_late_depth
-from topoloc.slam.input_checks import add_calibration, find_left_out_lens
+from topoloc.slam.input_checks import PairMatches, add_calibration, find_left_out_lens
 from topoloc.slam.measured_steps import MatchedPoints, MeasuredStep, measure_steps
 from topoloc.slam.still_part import find_still_part
 
@@ -52,15 +53,17 @@ def check_calibration(
     )
 
 
-def find_image_faults(sequence: StereoSequence) -> list[str]:
+def find_image_faults(
+    sequence: StereoSequence, pairs: Sequence[PairMatches] | None = None
+) -> list[str]:
     """Return a note for each fault of a recording without poses that its images or times show.
-    Raises as the recording."""
+    `pairs` are those of `check_stereo`, if it was called before. Raises as the recording."""
     max_interval_s = 10.0  # median; a longer one is of another unit than the second
     interval = float(np.median(np.diff(sequence.t_ns))) / 1e9 if len(sequence) > 1 else 0.0
     is_single = sequence[0].right is None and sequence[0].depth is None
     steps = [] if is_single else measure_steps(sequence, list(range(len(sequence))))
     notes = [find_still_part(sequence), find_depth_shift(sequence), find_late_depth(sequence)]
-    bent = find_left_out_lens(sequence) or _find_ray_depth(sequence, steps)
+    bent = find_left_out_lens(sequence, pairs) or _find_ray_depth(sequence, steps)
     # both look like another focal length, too
     notes.append(bent or _find_focal_problem(sequence, steps))
     if (camera := sequence[0].camera) is not None:
@@ -130,16 +133,23 @@ def _median(logs: Sequence[float]) -> tuple[float, float]:
 def _fit_focal(points: MatchedPoints) -> float | None:
     """Return the logarithm of the stated focal length over the one with which the points fit best
     in the last image. None if it hardly matters."""
-    step, min_rise = 0.08, 6.0
-    factors = step * np.arange(-9.0, 10.0)
-    costs = np.array([_focal_cost(points, math.exp(factor)) for factor in factors])
-    if not np.isfinite(costs).all():
+    step, min_rise, most = 0.08, 6.0, 9
+
+    @cache
+    def cost(row: int) -> float:
+        return _focal_cost(points, math.exp(step * row))
+
+    coarse = range(-most, most + 1, 3)
+    k = min(coarse, key=cost)
+    k = min(range(max(k - 2, -most), min(k + 2, most) + 1), key=cost)
+    k = min(max(k, 1 - most), most - 1)
+    rows = np.arange(k - 1, k + 2)
+    if not np.isfinite([cost(row) for row in (*coarse, *rows.tolist())]).all():
         return None
-    k = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
-    square, linear, _ = np.polyfit(factors[k - 1 : k + 2], costs[k - 1 : k + 2], 2)
+    square, linear, _ = np.polyfit(step * rows, [cost(row) for row in rows.tolist()], 2)
     if square * step**2 < min_rise:
         return None
-    return float(np.clip(0.5 * linear / square, -factors[k + 1], -factors[k - 1]))
+    return float(np.clip(0.5 * linear / square, -step * (k + 1), -step * (k - 1)))
 
 
 def _focal_cost(points: MatchedPoints, factor: float) -> float:

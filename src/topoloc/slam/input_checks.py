@@ -23,12 +23,18 @@ from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import find_depth_units
 from topoloc.slam.keyframes import KeyFrame, Landmarks
 
+PairMatches = tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, "2"]]
+"""x and y of matched features of a pair on the plane z = 1, in the left and in the right rectified
+image, and the focal lengths (pixels) of these images."""
 
-def check_stereo(sequence: StereoSequence) -> None:
+_MIN_NUM_PAIRS = 24  # that are matched, spread over the recording
+
+
+def check_stereo(sequence: StereoSequence) -> list[PairMatches]:
     """Check that the left and right images of a recording are rectified pairs in the right order.
 
     Features of some pairs, spread over the recording, are matched over the whole images. Other
-    recordings, and pairs with too few matches, pass.
+    recordings, and pairs with too few matches, pass. Return the matches of these pairs.
 
     Raises:
         CalibrationError: the baseline cannot be in metres.
@@ -43,20 +49,20 @@ def check_stereo(sequence: StereoSequence) -> None:
     if not len(sequence):
         raise RecordingError(f"{sequence.name}: no frames")
     if (rig := sequence[0].rig) is None:
-        return
+        return []
     if rig.baseline > max_baseline:
         raise CalibrationError(
             f"{sequence.name}: a baseline of {rig.baseline:g} m; is it in millimetres"
             f" ({rig.baseline / 1000:.4g} m) or centimetres ({rig.baseline / 100:.4g} m)?"
         )
-    num_pairs = min(100, max(24, len(sequence) // 10))
-    rows = np.unique(np.linspace(0, len(sequence) - 1, num_pairs).astype(int)).tolist()
-    shifts = list(parallel_map(_match_pair, (sequence[k] for k in rows)))
+    rows = _spread(sequence, min(100, max(_MIN_NUM_PAIRS, len(sequence) // 10)))
+    pairs = list(parallel_map(_match_pair, (sequence[k] for k in rows)))
+    shifts = [_shifts_px(*pair) for pair in pairs]
     is_left, vertical = _compare_pairs(shifts)
     is_pair = not vertical > max(max_vertical_px, max_vertical_share * rig.left.width)
     if not is_pair and is_left:  # rectified, swapped images are no pairs
-        exchanged = list(parallel_map(_match_pair, (_exchange(sequence[k]) for k in rows[::3])))
-        is_left = not _compare_pairs(exchanged)[1] < 0.5 * vertical
+        exchanged = parallel_map(_match_pair, (_exchange(sequence[k]) for k in rows[::3]))
+        is_left = not _compare_pairs([_shifts_px(*one) for one in exchanged])[1] < 0.5 * vertical
     if not is_left:
         raise RecordingError(
             f"{sequence.name}: left and right pictures are swapped: points lie further right in the"
@@ -72,6 +78,11 @@ def check_stereo(sequence: StereoSequence) -> None:
             f" {vertical:.1f} px apart vertically (median); taken at different moments, or not"
             " rectified as calibrated?"
         )
+    return pairs
+
+
+def _spread(sequence: StereoSequence, num: int) -> list[int]:
+    return np.unique(np.linspace(0, len(sequence) - 1, num).astype(int)).tolist()
 
 
 def _check_stretches(
@@ -108,7 +119,7 @@ def _find_change(sequence: StereoSequence, good: int, bad: int) -> int:
     rig = sequence[bad].rig
     while rig is not None and abs(good - bad) > 1:
         middle = (good + bad) // 2
-        if _is_pair(_match_pair(sequence[middle]), rig.left.width):
+        if _is_pair(_shifts_px(*_match_pair(sequence[middle])), rig.left.width):
             good = middle
         else:
             bad = middle
@@ -173,20 +184,25 @@ def _compare_pairs(matched: Sequence[Float[np.ndarray, "_ 2"]]) -> tuple[bool, f
     return is_left, float(np.median(np.abs(shifts[:, 1])))
 
 
-def find_left_out_lens(sequence: StereoSequence) -> str | None:
+def find_left_out_lens(
+    sequence: StereoSequence, pairs: Sequence[PairMatches] | None = None
+) -> str | None:
     """Return a note if the points of pairs ask for a lens that the calibration leaves out. None if
-    there are no pairs, or they do not decide. Raises as the recording.
+    there are no pairs, or they do not decide. `pairs` are those of `check_stereo`, if it was called
+    before. Raises as the recording.
 
     Of a point (x, y) on the plane z = 1 with disparity d, a lens of radial coefficient k moves the
     two images apart vertically by 2 k x y d. A wrong rotation, focal length or direction of the
     baseline moves them by other functions of x, y and d.
     """
     # k of right recordings of ZED, KITTI, EuRoC and the demo: up to 0.03
-    num_pairs, min_pairs, min_matches, min_k = 24, 8, 60, 0.07
+    min_pairs, min_matches, min_k = 8, 60, 0.07
     if not len(sequence) or sequence[0].rig is None:
         return None
-    rows = np.unique(np.linspace(0, len(sequence) - 1, num_pairs).astype(int)).tolist()
-    pairs = parallel_map(_match_normalized, (sequence[k] for k in rows))
+    if pairs is None:
+        rows = _spread(sequence, _MIN_NUM_PAIRS)
+        pairs = list(parallel_map(_match_pair, (sequence[k] for k in rows)))
+    pairs = pairs[:: max(1, len(pairs) // _MIN_NUM_PAIRS)]
     matched = [one for one, _ in pairs if len(one) >= min_matches]
     if len(matched) < min_pairs:
         return None
@@ -219,18 +235,15 @@ def _fit_lens(matches: Float[np.ndarray, "n 4"]) -> float:
     return float(solution[0])
 
 
-def _match_pair(frame: StereoFrame) -> Float[np.ndarray, "n 2"]:
-    """Return how far features lie left, and below, of where the right image shows them, pixels. A
-    point at infinity has 0."""
-    matches, focal = _match_normalized(frame)
-    return (matches[:, :2] - matches[:, 2:]) * focal
+def _shifts_px(
+    matches: Float[np.ndarray, "n 4"], focal_px: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "n 2"]:
+    """Return how far features of a pair lie left, and below, of where the right image shows them,
+    pixels. A point at infinity has 0."""
+    return (matches[:, :2] - matches[:, 2:]) * focal_px
 
 
-def _match_normalized(
-    frame: StereoFrame,
-) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, "2"]]:
-    """Return x and y of matched features of a pair on the plane z = 1, in the left and in the right
-    rectified image, and the focal lengths (pixels) of these images."""
+def _match_pair(frame: StereoFrame) -> PairMatches:
     view = prepare_frame(frame)
     if view.right_grey is None or view.rig is None:
         return np.zeros((0, 4)), np.ones(2)

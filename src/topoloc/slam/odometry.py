@@ -113,7 +113,7 @@ class Odometry(FrameTracker):
         is_next = bool(is_near) and not prediction.is_gap
         if step is not None and is_next and not self._repetitions.is_likely(prediction, step):
             return step
-        if self._num_lost == 0:
+        if self._num_lost == 0 and not is_next:
             self._repeated_motions = estimator.find_repeated_motions(prediction)
         if step is None or (
             prediction.is_gap and not is_near and step.inlier_ratio < min_gap_share

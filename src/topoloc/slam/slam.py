@@ -284,9 +284,9 @@ def run_slam(
     tracked: list[list[FramePose | None]] = []
     residuals: list[np.ndarray] = []
     for number, sequence in enumerate(sequences):
-        check_stereo(sequence)
+        pairs = check_stereo(sequence)
         if warn is not None:
-            for note in find_image_faults(sequence):
+            for note in find_image_faults(sequence, pairs):
                 warn(note)
         odometry = Odometry(number, keyframes, landmarks)
         tracked.append(_track_recording(sequence, odometry, progress))

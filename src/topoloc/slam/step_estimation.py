@@ -52,7 +52,7 @@ class Tracks:
         moved = np.linalg.norm(self.points_img - self.points_ref, axis=1)
         return float(np.median(moved)) if len(moved) else 0.0
 
-    def select(self, rows: np.ndarray) -> Tracks:
+    def select(self, rows: np.ndarray | slice) -> Tracks:
         """Return the given rows."""
         return Tracks(*(column[rows] for column in vars(self).values()))
 
@@ -130,11 +130,9 @@ class StepEstimator:
         min_share = 0.3  # minimum share of the visible points that agree at a repetition
         max_repeats = 8  # maximum number of repetition periods by which a step may be off
         itself, last = replace(self, measured=self.last.measured), self.last.cam_from_world
-        steps = parallel_map(itself.estimate_step, self._sample_start_poses(last, prediction))
+        steps = itself._search(self._sample_start_poses(last, prediction), last, min_share)
         shifts = [
-            step.cam_from_world @ last.inverse()
-            for step in steps
-            if step is not None and step.inlier_ratio > min_share
+            step.cam_from_world @ last.inverse() for step in steps if step.inlier_ratio > min_share
         ]
         shifts = [shift for shift in shifts if not self.is_close(shift, Rigid3.identity())]
         if not shifts:
@@ -151,14 +149,37 @@ class StepEstimator:
         if np.isinf(prediction.sigma):
             moved = step.cam_from_world @ self.last.cam_from_world.inverse()
             prediction = replace(prediction, step=moved)
-        starts = [step.cam_from_world, *self._sample_start_poses(step.cam_from_world, prediction)]
-        found = [one for one in parallel_map(self.estimate_step, starts) if one is not None]
+        pose = step.cam_from_world
+        again, least = self.estimate_step(pose), min_share * step.inlier_ratio
+        found = [one for one in [again] if one is not None]
+        found += self._search(self._sample_start_poses(pose, prediction), pose, least)
         enough = min_share * max((one.inlier_ratio for one in found), default=0.0)
         poses = list(repeated)
         for pose in (one.cam_from_world for one in found if one.inlier_ratio >= enough):
             if not any(self.is_close(pose, known) for known in poses):
                 poses.append(pose)
         return poses
+
+    def _search(
+        self, starts: Sequence[Rigid3], known: Rigid3, min_inlier_ratio: float
+    ) -> list[Step]:
+        """Return the steps from other start poses (cam_from_world) to poses that are not close to a
+        known one, those at first sight with too few inliers left out.
+
+        First sight is that of every third point, or of more if the points are few.
+        """
+        loss = 0.7  # of `min_inlier_ratio` suffices at first sight
+        stride = min(max(len(self.tracks.landmark_ids) // (4 * self.min_tracked), 1), 3)
+        thinned = replace(self, tracks=self.tracks.select(slice(None, None, stride)))
+        sketches = parallel_map(thinned.estimate_step, starts)
+        promising = [
+            one.cam_from_world
+            for one in sketches
+            if one is not None
+            and one.inlier_ratio > loss * min_inlier_ratio
+            and not self.is_close(one.cam_from_world, known)
+        ]
+        return [one for one in parallel_map(self.estimate_step, promising) if one is not None]
 
     def _sample_start_poses(self, centre: Rigid3, prediction: Prediction) -> list[Rigid3]:
         """Return start poses around one along the predicted motion, as far apart as tracking

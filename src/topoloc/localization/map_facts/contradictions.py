@@ -83,9 +83,10 @@ def find_contradictions(topomap: TopoMetricMap) -> list[Contradiction]:
         order = np.argsort(node_distances(summary.world_from_cam, poses, lambda_rot), kind="stable")
         neighbours = [int(k) for k in order if k != row][:num_neighbours]
         neighbours += [k for k in (row - 1, row + 1) if 0 <= k < len(group) and k not in neighbours]
-        node = topomap.nodes[row]
         for other_row in neighbours:
-            difference = _pose_difference(node, topomap.nodes[other_row], rho)
+            if group[row] == group[other_row]:
+                continue  # contradictions within a group do not count
+            difference = _pose_difference(topomap.nodes[row], topomap.nodes[other_row], rho)
             if difference is None:
                 continue
             is_same, metres, radians = difference
@@ -95,8 +96,7 @@ def find_contradictions(topomap: TopoMetricMap) -> list[Contradiction]:
                 found.append((row, other_row, metres, radians))
             else:
                 low, high = sorted((group[row], group[other_row]))
-                if low != high:
-                    group = [low if number == high else number for number in group]
+                group = [low if number == high else number for number in group]
     return _outside_largest_group(topomap, group, found)
 
 
