@@ -1,7 +1,7 @@
 """Streams: what is asked of the tracker beside what is measured.
 
     python benchmarks/streams.py [--shared ../shared] [--stream NAME MAP_SEQ STREAM_SEQ ...]
-        [--only NAME] [--json FILE]
+        [--only NAME] [--turns] [--json FILE]
 
 Maps one recording (or part of one) and streams another: 7-Scenes' kitchen, one frame in four mapped
 and the others streamed; the ZED camera's second session in a map of its first; the demo's lab by
@@ -9,7 +9,8 @@ day, pictures half a second apart. Further pairs are named by `--stream`. Errors
 smoothed pose against the recording's truth, "inside" counts those within the 95 % ellipsoid of its
 covariance. Jitter is the root mean square of the error of the step from frame to frame, for the
 stream and for the same pictures localized one by one. Milliseconds are processor time of one
-process, which a busy machine does not change.
+process, which a busy machine does not change. `--turns` streams the same images with quick turns,
+blur and dark seconds instead, without a gyroscope and with one (`turned_streams.py`).
 
 Where the truth trembles itself (7-Scenes, ZED), a jitter measured against it is the truth's as
 well. So where the streamed recording has a second view or depth, which the tracker does not get,
@@ -52,6 +53,7 @@ from topoloc.slam.slam import run_slam
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
+from turned_streams import compare_with_gyroscope
 
 CHI_SQUARE_6_AT_95 = 12.592
 DEMO = Path(__file__).parents[1] / "src" / "topoloc" / "demo" / "lab"
@@ -79,6 +81,7 @@ def main() -> None:
         "--stream", nargs=3, action="append", default=[], metavar=("NAME", "MAP_SEQ", "STREAM_SEQ")
     )
     parser.add_argument("--only", help="the name of one stream")
+    parser.add_argument("--turns", action="store_true", help="with quick turns and a gyroscope")
     parser.add_argument("--json", type=Path, help="write the figures of each stream to this file")
     args = parser.parse_args()
     cv2.setNumThreads(2)
@@ -89,7 +92,9 @@ def main() -> None:
             for name, mapped, streamed in args.stream
         ),
     ]
-    figures = {pair.name: judge(pair) for pair in pairs if args.only in (None, pair.name)}
+    figures = {
+        pair.name: judge(pair, args.turns) for pair in pairs if args.only in (None, pair.name)
+    }
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1))
 
@@ -116,7 +121,7 @@ def known_pairs(shared: Path) -> list[Pair]:
     ]
 
 
-def judge(pair: Pair) -> dict[str, float]:
+def judge(pair: Pair, with_turns: bool = False) -> dict[str, float]:
     """Print the figures of a stream, and return the main ones."""
     localizer = Localizer(build_map([open_sequence(path) for path in pair.mapped]))
     sequence = as_monocular(open_sequence(pair.streamed))
@@ -130,6 +135,9 @@ def judge(pair: Pair) -> dict[str, float]:
         for frame in frames
         if frame.world_from_cam is not None
     ]
+    if with_turns:
+        print(f"{pair.name}:")
+        return dict(compare_with_gyroscope(localizer, frames, truths))
     warm_up(localizer, frames)
     singles = [localizer.localize(frame.image, _camera(frame)) for frame in frames]
     print(f"{pair.name}: {len(frames)} frames, a map of {len(localizer.topomap.nodes)} nodes")

@@ -31,6 +31,7 @@ from topoloc.recordings.frame import to_grey
 from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
+from topoloc.tracking.gyroscope import Gyroscope
 from topoloc.tracking.motion import MotionHypothesis, MotionState, update_motion
 from topoloc.tracking.point_tracker import PointTracker
 from topoloc.tracking.pose_hypotheses import PoseHypotheses
@@ -60,10 +61,14 @@ class MapStream:
     hypothesis that no image has confirmed."""
 
     def __init__(
-        self, localizer: Localizer, config: TrackerConfig, prior: MotionHypothesis | None = None
+        self,
+        localizer: Localizer,
+        config: TrackerConfig,
+        prior: MotionHypothesis | None = None,
+        gyroscope: Gyroscope | None = None,
     ) -> None:
         self.localizer, self.config, self._window = localizer, config, PoseWindow()
-        self._hypotheses = PoseHypotheses(config.hypotheses.motion, prior)
+        self._hypotheses = PoseHypotheses(config.hypotheses.motion, prior, gyroscope)
         self._stream_localizer = StreamLocalizer(localizer, self._hypotheses)
         self._last_smoothed: Rigid3 | None = None
         self._reference: ReferenceImage | None = None

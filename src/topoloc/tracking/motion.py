@@ -53,6 +53,26 @@ class MotionState:
         return self.covariance[:6, :6]
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredTurn:
+    """Hold the rotation of the camera since a state, as a gyroscope measured it.
+
+    `rotvec` is a rotation vector in the camera's axes at the state, radians. `sigma` is its
+    standard deviation about each axis.
+    """
+
+    rotvec: Float[np.ndarray, "3"]
+    sigma: float
+
+    def replace_velocity(self, state: MotionState, seconds: float) -> MotionState:
+        """Return the state with the mean angular velocity of the turn, which takes `seconds`."""
+        velocity, covariance = state.velocity.copy(), state.covariance.copy()
+        velocity[3:] = self.rotvec / seconds
+        covariance[9:], covariance[:, 9:] = 0.0, 0.0
+        covariance[9:, 9:] = (self.sigma / seconds) ** 2 * np.eye(3)
+        return replace(state, velocity=velocity, covariance=covariance)
+
+
 def start_motion(
     t_ns: int, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> MotionState:
@@ -70,12 +90,16 @@ def start_motion(
 
 
 def predict_motion(
-    state: MotionState, t_ns: int, config: MotionConfig, before_from_cam: Rigid3 | None = None
+    state: MotionState,
+    t_ns: int,
+    config: MotionConfig,
+    before_from_cam: Rigid3 | None = None,
+    turn: MeasuredTurn | None = None,
 ) -> MotionState:
     """Predict the state at a later time.
 
     External odometry replaces the velocity if it is given. `before_from_cam` is its motion since
-    the state.
+    the state. Else `turn` replaces the angular velocity.
     """
     # Seconds for which the velocity is extrapolated. The predicted camera stands still after
     # that.
@@ -84,29 +108,26 @@ def predict_motion(
     odometry_share = 0.05
     # Standard deviation of external odometry that is added to this share, metres and radians.
     odometry_sigma, seconds = 0.002, (t_ns - state.t_ns) / 1e9
-    step = (
-        Rigid3.exp(min(seconds, max_step) * state.velocity)
-        if before_from_cam is None
-        else before_from_cam
-    )
+    spans, sigma_angular = np.full(6, min(seconds, max_step)), config.sigma_angular_acceleration
+    if turn is not None and before_from_cam is None:
+        state, spans[3:], sigma_angular = turn.replace_velocity(state, seconds), seconds, 0.0
+    step = Rigid3.exp(spans * state.velocity) if before_from_cam is None else before_from_cam
     transition = np.eye(12)
     transition[:6, :6] = step.inverse().adjoint()
-    acceleration = np.diag(
-        np.repeat([config.sigma_acceleration**2, config.sigma_angular_acceleration**2], 3)
-    )
+    acceleration = np.diag(np.repeat([config.sigma_acceleration**2, sigma_angular**2], 3))
     # The acceleration is white and moves as far in a step as a constant one. A constant
     # acceleration would tie pose and velocity so firmly that a velocity error changes its sign with
     # each exact pose and never fades.
     noise = np.zeros((12, 12))
     noise[6:, 6:] = 0.75 * seconds**2 * acceleration
     if before_from_cam is None:
-        transition[:6, 6:] = min(seconds, max_step) * np.eye(6)
+        transition[:6, 6:] = np.diag(spans)
         noise[:6, :6] = seconds**4 / 4.0 * acceleration
         noise[:6, 6:] = noise[6:, :6] = seconds**3 * 3.0 / 8.0 * acceleration
         velocity = state.velocity
     else:
-        way, turn = float(np.linalg.norm(step.translation)), step.angle()
-        sigmas = np.repeat([odometry_share * way, odometry_share * turn], 3) + odometry_sigma
+        way, angle = float(np.linalg.norm(step.translation)), step.angle()
+        sigmas = np.repeat([odometry_share * way, odometry_share * angle], 3) + odometry_sigma
         noise[:6, :6] = np.diag(sigmas**2)
         velocity = step.log() / seconds if seconds > 0 else state.velocity
     covariance = transition @ state.covariance @ transition.T + noise

@@ -27,7 +27,9 @@ from msgspec import structs
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
 from topoloc.node_ids import NodeId
+from topoloc.tracking.gyroscope import Gyroscope
 from topoloc.tracking.motion import (
+    MeasuredTurn,
     MotionConfig,
     MotionHypothesis,
     MotionState,
@@ -59,7 +61,7 @@ class PoseHypotheses:
     one.
 
     `is_track_continued` is True if the best hypothesis was the best before this image, or follows
-    from it.
+    from it. `is_turn_measured` is True if a gyroscope measured the rotation to this image.
     """
 
     miss: ClassVar[float] = 0.01
@@ -67,8 +69,14 @@ class PoseHypotheses:
     prediction_scale: ClassVar[float] = 2.5
     """Factor on the sigma of the prediction, because hands jerk and wheels hit kerbs."""
 
-    def __init__(self, motion: MotionConfig, prior: MotionHypothesis | None = None) -> None:
+    def __init__(
+        self,
+        motion: MotionConfig,
+        prior: MotionHypothesis | None = None,
+        gyroscope: Gyroscope | None = None,
+    ) -> None:
         self.motion, self.is_track_continued = motion, False
+        self._gyroscope, self.is_turn_measured = gyroscope, False
         self._ranked = list[MotionHypothesis]() if prior is None else [prior]
         self._null_weight = 1.0 if prior is None else 1.0 - prior.weight
 
@@ -126,21 +134,29 @@ class PoseHypotheses:
         Those without a measurement for too long are dropped.
         """
         max_seconds = 1.0  # seconds without a measured pose after which a hypothesis is dropped
+        max_seconds_with_gyroscope = 3.0  # the same if the rotation is measured
         max_seconds_with_odometry = 20.0  # the same with external odometry
         before, alive = self._ranked, list[MotionHypothesis]()
+        self.is_turn_measured = False
         for hypothesis in before:
+            turn = self._measure_turn(hypothesis.state.t_ns, t_ns)
             motion, limit = None, max_seconds
+            if turn is not None:
+                self.is_turn_measured, limit = True, max_seconds_with_gyroscope
             if hypothesis.odom_from_cam is not None and odom_from_cam is not None:
                 motion = hypothesis.odom_from_cam.inverse() @ odom_from_cam
                 limit = max_seconds_with_odometry
             if t_ns - hypothesis.state.t_ns <= limit * 1e9:
-                current = predict_motion(hypothesis.state, t_ns, self.motion, motion)
+                current = predict_motion(hypothesis.state, t_ns, self.motion, motion, turn)
                 alive.append(replace(hypothesis, current=current, candidate_idx=None))
         self.is_track_continued = bool(alive) and alive[0].state is before[0].state
         left = sum(hypothesis.weight for hypothesis in alive)
         # dropped weight counts as "elsewhere"
         self._prune(alive if self.is_track_continued or left > 0.5 else [], 1.0 - left)
         return self.best
+
+    def _measure_turn(self, start_ns: int, end_ns: int) -> MeasuredTurn | None:
+        return None if self._gyroscope is None else self._gyroscope.measure_turn(start_ns, end_ns)
 
     def hold(self, t_ns: int, odom_from_cam: Rigid3 | None) -> None:
         """Move all hypotheses to a later time, because the camera stands since the last image,

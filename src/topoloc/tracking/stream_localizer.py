@@ -18,6 +18,8 @@ from topoloc.tracking.motion import is_same_place
 from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses
 from topoloc.tracking.tracker_state import PoseErrors, StreamFrame, compute_pose_errors
 
+_NOTHING_SEEN = ("too_few_matches", "too_few_inliers")
+
 
 @dataclass(frozen=True, eq=False)
 class ExpectedPose:
@@ -83,6 +85,9 @@ class StreamLocalizer:
         if len(candidates) != 1 or not self._hypotheses.is_expected(candidates[0]):
             refusal, found = self._localize_globally(frame)
             candidates = [localized.as_candidate(pose_covariance) for localized in found]
+        is_bridged = self._hypotheses.is_turn_measured and not found
+        if refusal is not None and is_bridged and refusal.reason in _NOTHING_SEEN:
+            return refusal  # a dark image is no evidence, and the rotation through it is known
         self._hypotheses.update_weights(
             frame.t_ns, candidates, frame.odom_from_cam, self._compute_new_evidence(found)
         )

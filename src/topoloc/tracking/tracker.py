@@ -23,6 +23,7 @@ from topoloc.localization.result import Localization, NotLocalized, with_time
 from topoloc.recordings.frame import find_time_problem
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
+from topoloc.tracking.gyroscope import Gyroscope
 from topoloc.tracking.map_stream import MapStream
 from topoloc.tracking.motion import MotionHypothesis, is_same_place, start_motion
 from topoloc.tracking.repeated_images import Repeat, RepeatedImages
@@ -41,6 +42,7 @@ class Tracker:
     Args:
         localizer: the map or the atlas. The tracked tile stays open until `close`.
         cameras: estimates the camera of images without calibration. Others may share it.
+        gyroscope: predicts rotations between images. It is used once the images confirm it.
 
     Raises:
         ConfigError: a value of `config` is out of bounds.
@@ -51,8 +53,10 @@ class Tracker:
         localizer: Localizer,
         config: TrackerConfig | None = None,
         cameras: SharedCameras | None = None,
+        gyroscope: Gyroscope | None = None,
     ) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
+        self.gyroscope = gyroscope
         self.cameras = cameras or SharedCameras(localizer)
         check_bounds(self.config)
         self._tile = ExitStack()
@@ -115,6 +119,8 @@ class Tracker:
             return self._confirm_repeat(self._answer, t_ns)
         self._repeats.start(image, t_ns, odom_from_cam)
         self._answer = self._process_in_tile(image, camera, t_ns, odom_from_cam, limit)
+        if self.gyroscope is not None:
+            self.gyroscope.observe(self._answer)
         is_found = self._answer.state in _LOCALIZED_STATES
         self._repeats.learn_noise(t_ns, odom_from_cam, self._answer.smoothed if is_found else None)
         return self._answer
@@ -141,7 +147,7 @@ class Tracker:
         node_id = self._stream.localizer.topomap.summaries[0].node_id  # means nothing
         pose = Rigid3.identity()
         prior = MotionHypothesis(state, odom_from_cam, state, probability, node_id, pose, None)
-        self._stream = MapStream(self._stream.localizer, self.config, prior)
+        self._stream = MapStream(self._stream.localizer, self.config, prior, self.gyroscope)
 
     def process_missing(
         self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None
@@ -195,7 +201,9 @@ class Tracker:
             camera = camera if shared is None else shared.camera
         if isinstance(camera, UncalibratedCamera) or self.config.mode == "paper":
             return answer
-        stream = None if self._stream is None else MapStream(self._stream.localizer, self.config)
+        stream = None
+        if self._stream is not None:
+            stream = MapStream(self._stream.localizer, self.config, None, self.gyroscope)
         if stream is None or len(self.localizer.tile_ids) > 1:
             found = self.localizer.localize(image, camera, max_ms=limit, t_ns=t_ns)
             if not isinstance(found, Localization):
@@ -245,7 +253,7 @@ class Tracker:
         """Start the stream in this tile. Its map stays open."""
         self.close()
         in_tile = self._tile.enter_context(self.localizer.in_tile(tile_id))
-        self._stream = MapStream(in_tile, self.config)
+        self._stream = MapStream(in_tile, self.config, None, self.gyroscope)
         return self._stream
 
     def _check_time(self, t_ns: int, is_repeat_allowed: bool = False) -> None:

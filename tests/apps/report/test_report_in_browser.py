@@ -10,6 +10,7 @@ import pytest
 
 from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 from in_browser import CONTRASTS, UNNAMED, chromium, opened
+from topoloc.apps.report.page_template import STYLE
 from topoloc.apps.report.report import write_report
 from topoloc.evaluation.metrics import summarize
 
@@ -54,6 +55,16 @@ def test_nothing_is_cut_off_and_all_can_be_read(browser: Any, report: Path, widt
         assert page.evaluate(UNNAMED) == []
         lowest = page.evaluate(CONTRASTS)[0]
         assert lowest[0] >= 4.5, lowest
+
+
+def test_text_of_plots_has_nine_pixels_on_a_phone(browser: Any, report: Path):
+    assert STYLE["font.size"] >= 9.0  # points; no other size of a figure is smaller
+    scales = """() => [...document.querySelectorAll("svg[role=img]")].map(
+      (figure) => figure.getBoundingClientRect().width / figure.viewBox.baseVal.width)"""
+    with opened(browser, report.as_uri(), 400) as page:
+        found = page.evaluate(scales)
+        assert len(found) >= 4
+        assert min(found) >= 0.99, found
 
 
 def test_the_scene_holds_every_answer(browser: Any, report: Path):

@@ -122,6 +122,11 @@ def test_maps_are_described(client: httpx.Client, maps: Path):
         assert described["num_nodes"] == len(described["nodes"]) == len(topomap.summaries)
         assert described["georeference"] == topomap.georeference.to_json()  # pyright: ignore[reportOptionalMemberAccess]
         assert described["junctions"] == topomap.junctions
+        folders = [Path(session.recording).parent for session in topomap.sessions]
+    assert all(folder.is_absolute() for folder in folders)
+    assert not [folder for folder in folders if str(folder) in json.dumps(described)]
+    assert str(maps) not in json.dumps(described)
+    with TopoMetricMap.load(maps / "earth.topo") as topomap:
         assert [session["name"] for session in described["sessions"]] == [
             session.name for session in topomap.sessions
         ]
@@ -150,6 +155,7 @@ def test_a_damaged_map_is_a_503_and_affects_no_other_map(
     damaged = client.post("/v1/maps/damaged/localize", files={"image": view.open("rb")}, data=data)
     assert damaged.status_code == 503
     assert "damaged" in damaged.json()["error"]
+    assert "/" not in damaged.json()["error"]  # no folder of the service's machine
     assert client.post(
         "/v1/maps/room/localize", files={"image": view.open("rb")}, data=data
     ).json()["localized"]
@@ -165,10 +171,12 @@ def test_maps_that_cannot_be_opened_do_not_keep_others_from_an_answer(
         alone = client.post("/v1/localize", **query)
         assert alone.status_code == 503
         assert "broken" in alone.json()["error"]
+        assert str(tmp_path) not in alone.text
         shutil.copy(maps / "earth.topo", tmp_path / "earth.topo")
         found = client.post("/v1/localize", **query).json()
         assert (found["localized"], found["map"]) == (True, "earth")
         assert [one["map"] for one in found["failed"]] == ["broken"]
+        assert str(tmp_path) not in json.dumps(found)
 
 
 def test_metrics_count_answers(client: httpx.Client, view: Path, camera: str):

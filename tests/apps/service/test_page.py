@@ -301,6 +301,7 @@ def test_the_token_is_requested(room_map: Path, tmp_path: Path, browser: Any):
     with running(room_map, "--token-file", tmp_path / "token") as service:
         page = browser.new_page()
         page.goto(f"{service.url}/")
+        page.get_by_text("The map is shown once the token is entered.").wait_for()
         page.get_by_label("This service needs a token").fill("wrong-token-of-some-length")
         page.keyboard.press("Enter")
         page.wait_for_selector("#answer h2.bad")

@@ -40,6 +40,11 @@ def test_a_port_in_use_is_one_line(complaint: Callable[..., str], maps: Path):
         assert "cannot listen" in complaint("serve", maps, "--port", taken.getsockname()[1])
 
 
+def test_a_folder_without_maps_is_served_with_a_warning(tmp_path: Path):
+    with running(tmp_path) as service:
+        assert any("no map yet; copy a .topo file there" in line for line in service.log)
+
+
 def test_only_requests_with_the_token_are_answered(maps: Path, view: Path, tmp_path: Path):
     (tmp_path / "token").write_text(TOKEN + "\n")
     with (

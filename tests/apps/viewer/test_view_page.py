@@ -236,6 +236,8 @@ def test_a_layer_goes_and_comes(browser: Any, shown: Shown):
     with opened(browser, shown.page.as_uri(), 1300) as page:
         before = page.locator("canvas").screenshot()
         box = page.locator("label", has_text="points").get_by_role("checkbox")
+        size = box.bounding_box()
+        assert min(size["width"], size["height"]) >= 24
         box.uncheck()
         page.wait_for_timeout(200)
         assert page.locator("canvas").screenshot() != before

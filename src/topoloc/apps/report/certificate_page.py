@@ -13,6 +13,7 @@ from topoloc.apps.report.page_template import (
     render_page,
     render_section,
     render_table,
+    render_wide,
 )
 from topoloc.apps.report.report_tables import render_quarters
 from topoloc.plugin import write_text
@@ -61,7 +62,7 @@ def write_certificate(path: Path, found: Certification, topomap: TopoMetricMap, 
         for answer in condition.answers
     ]
     if walks:
-        figure = f'<div class="wide">{draw_map(walks, topomap)}</div>'
+        figure = render_wide(draw_map(walks, topomap), "The map from above")
         sections.append(render_section("The map from above", _PLAN + _list_spots(found), figure))
     sections.append(render_section("Measured with", "", _render_facts(found)))
     subtitle = f"{one.date}, topoloc {one.program}, version {one.map_version} of the map"

@@ -143,7 +143,7 @@ def _evaluate_pose(tried: TriedProposal, result: Localization | NotLocalized) ->
     elif tried.refined is None:
         verdict = "the same as an earlier pose"
     else:
-        verdict = "rejected: too few of the points that must be visible were found"
+        verdict = f"rejected: only {tried.refined.num_inliers} points were found again"
     return EvaluatedPose(tried, None, verdict)
 
 

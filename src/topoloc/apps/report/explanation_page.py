@@ -149,7 +149,8 @@ def row_of(pose: EvaluatedPose) -> tuple[str, ...]:
     """Return the cells of a pose in the order of `_COLUMNS`."""
     node = str(pose.tried.fit.node_id) if pose.tried.fit.node_id >= 0 else ""
     first = f"{pose.tried.first.num_inliers} of {len(pose.tried.first.matches)}"
-    evidence = ("", "", "", "")
+    refined = pose.tried.refined  # of a rejected pose; what must be visible was not counted
+    evidence = ("" if refined is None else str(refined.num_inliers), "", "", "")
     if pose.tried.hypothesis is not None:
         e = pose.tried.hypothesis.evidence
         found, unguided = f"{e.num_found} of {e.num_visible}", f"{e.num_inliers} of {e.num_matches}"

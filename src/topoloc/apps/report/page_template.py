@@ -60,7 +60,14 @@ def svg_text(figure: Figure, title: str) -> str:
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = re.sub(r'<g id="[^"]*"', "<g", text[text.index("<svg") :])
-    return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)
+    width = round(72 * figure.get_figwidth())  # one pixel a point, so that text stays readable
+    style = f'style="--width: {width}px"'
+    return text.replace("<svg ", f'<svg role="img" aria-label="{title}" {style} ', 1)
+
+
+def render_wide(figure: str, label: str) -> str:
+    """Return a figure that scrolls on a narrow screen. `label` names it for screen readers."""
+    return f'<div class="wide" tabindex="0" role="region" aria-label="{label}">{figure}</div>'
 
 
 def page_style() -> str:
@@ -114,9 +121,9 @@ def render_table(
     """
     head = "".join(f"<th>{name}</th>" for name in columns)
     body = "".join(f"<tr>{_render_cells(columns, row)}</tr>" for row in rows)
-    region = f' tabindex="0" role="region" aria-label="{label}"' if label else ""
     table = f'<table class="{kind} folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
-    return f'<div class="wide"{region}>{table}</table></div>'
+    table += "</table>"
+    return render_wide(table, label) if label else f'<div class="wide">{table}</div>'
 
 
 def _render_cells(columns: Sequence[str], row: Sequence[str]) -> str:

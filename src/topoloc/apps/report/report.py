@@ -35,6 +35,7 @@ from topoloc.apps.report.page_template import (
     render_gallery_items,
     render_page,
     render_section,
+    render_wide,
 )
 from topoloc.apps.report.report_tables import (
     ReportTexts,
@@ -230,7 +231,9 @@ def _render_sections(
     name = Path(evaluation["map"]["path"]).name
     document = create_document(topomap, name, sets, _SCENE_BUDGET)
     yield render_section("The place", _SCENE, embedded_scene(document))
-    yield render_section("The map from above", _MAP, _scrollable(draw_map(answers, topomap)))
+    yield render_section(
+        "The map from above", _MAP, render_wide(draw_map(answers, topomap), "The map from above")
+    )
     if evaluation["num_localized"]:
         curves = f'<div class="halves">{"".join(draw_error_curves(answers))}</div>'
         yield render_section("Error curves", _CURVES, curves)
@@ -241,18 +244,13 @@ def _render_sections(
     gallery = render_gallery(worst, topomap) if worst else ""
     yield render_section("The worst answers", _WORST if worst else _NO_WORST, gallery)
     if evaluation["num_queries"]:
-        figure = _scrollable(draw_errors_along(answers))
+        figure = render_wide(draw_errors_along(answers), "Errors along the recordings")
         yield render_section("Errors along the recordings", _ALONG, figure)
     if evaluation["median_times_ms"]:
-        yield render_section("Times", _TIMES, _scrollable(draw_stage_times(answers)))
+        yield render_section("Times", _TIMES, render_wide(draw_stage_times(answers), "Times"))
     yield render_section("All numbers", "", render_number_tables(evaluation))
     config = escape(json.dumps(evaluation["map"]["config"], indent=1, sort_keys=True))
     yield (
         "<section><details><summary>The settings of the map</summary>"
         f"<pre>{config}</pre></details></section>"
     )
-
-
-def _scrollable(figure: str) -> str:
-    """Wrap a figure that scrolls on a narrow screen."""
-    return f'<div class="wide">{figure}</div>'

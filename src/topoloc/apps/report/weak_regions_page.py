@@ -21,6 +21,7 @@ from topoloc.apps.report.page_template import (
     render_page,
     render_section,
     render_table,
+    render_wide,
 )
 from topoloc.plugin import write_text
 
@@ -54,7 +55,7 @@ def write_weak_regions(
     """Write the page atomically. The same map gives the same bytes. `info`:
     `TopoMetricMap.describe` of the map. Raises TopolocError: the file cannot be written."""
     advice = f'<p class="lead">{escape(weak.suggest_next_recording())}</p>'
-    figure = f'<div class="wide">{draw_weak_regions(weak, topomap)}</div>'
+    figure = render_wide(draw_weak_regions(weak, topomap), "The map from above")
     images = _render_images(weak, topomap)
     sections = [
         _render_cards(weak),

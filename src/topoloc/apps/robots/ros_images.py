@@ -28,6 +28,14 @@ def is_topic(source: str) -> bool:
     return source.startswith(PREFIX)
 
 
+def topic_of(source: str, example: str) -> str:
+    """Return the name of a topic with its slash. Raises RecordingError: the source names none."""
+    topic = f"/{source.removeprefix(PREFIX).lstrip('/')}"
+    if not re.fullmatch(r"(/[A-Za-z]\w*)+", topic, re.ASCII):
+        raise RecordingError(f"{source[:80]}: no topic of ROS; ros:/{example} is expected")
+    return topic
+
+
 class RosImages:
     """The images of a topic. `num_taken` counts them, and `num_dropped` those that a newer one
     replaced. `fault` says why there are none, `notes` what is mended.
@@ -44,11 +52,7 @@ class RosImages:
         self, node: RosNode, source: str, has_camera: bool, warn: Callable[[str], None]
     ) -> None:
         messages, compressed = node.messages, "/compressed"
-        self.topic = f"/{source.removeprefix(PREFIX).lstrip('/')}"
-        if not re.fullmatch(r"(/[A-Za-z]\w*)+", self.topic, re.ASCII):
-            raise RecordingError(
-                f"{source[:80]}: no topic of ROS; ros:/camera/image_raw is expected"
-            )
+        self.topic = topic_of(source, "camera/image_raw")
         kind = messages.Image
         if self.topic.endswith(compressed):
             kind = messages.CompressedImage

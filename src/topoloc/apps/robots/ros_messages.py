@@ -102,6 +102,17 @@ class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
 
 
 @dataclass
+class Imu(IdlStruct, typename="sensor_msgs::msg::dds_::Imu_"):
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: Matrix3x3
+    angular_velocity: Vector3
+    angular_velocity_covariance: Matrix3x3
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: Matrix3x3
+
+
+@dataclass
 class ImageHead(IdlStruct, typename="topoloc::ImageHead_"):
     """The fields of an image before its data."""
 

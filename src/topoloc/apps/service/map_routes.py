@@ -8,6 +8,7 @@ import threading
 from functools import cache, partial
 from hashlib import sha256
 from importlib import resources
+from pathlib import PurePath
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
@@ -122,7 +123,10 @@ async def get_map(request: Request, map: MapName) -> JSONResponse:
                 }
                 for summary in topomap.summaries
             ]
-            facts = topomap.describe(opened.path) | {"path": opened.path.name, "name": map}
+            facts: dict[str, Any] = topomap.describe(opened.path)
+            facts |= {"path": opened.path.name, "name": map}
+            for session in facts["sessions"]:  # clients need no folders of the mapper's machine
+                session["recording"] = PurePath(session["recording"]).name
             return facts | {"nodes": nodes}
 
     return JSONResponse(await service.run_job(request, describe))

@@ -41,7 +41,7 @@ from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.apps.report.explanation_page import compared_to_json, explanation_page
 from topoloc.apps.service.logs import log
 from topoloc.apps.service.query_request import QueryRequest, parse_camera_field
-from topoloc.apps.service.request_errors import RequestError
+from topoloc.apps.service.request_errors import RequestError, without_folders
 from topoloc.plugin import EncodedImage, image_size
 
 POLL_INTERVAL_S = 5.0
@@ -272,6 +272,8 @@ def combine_results(answers: Results, failures: Failures, query: str) -> dict[st
     ranked = sorted(answers, key=lambda name: -found[name].probability if name in found else 1.0)
     (only,) = found if len(found) == 1 else (None,)
     rows = [{"map": name, "result": answers[name].to_json(query)} for name in ranked]
-    failed = [{"map": name, "error": str(error)} for name, error in failures.items()]
+    failed = [
+        {"map": name, "error": without_folders(str(error))} for name, error in failures.items()
+    ]
     whole = {"query": query, "localized": bool(found), "map": only}
     return whole | {"answers": rows, "failed": failed}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from pydantic import ValidationError
 
 from topoloc import (
@@ -46,13 +48,18 @@ def to_request_error(error: Exception) -> RequestError:
     if isinstance(error, RequestError):
         return error
     if isinstance(error, MapNotFoundError):
-        return RequestError(404, str(error))
+        return RequestError(404, without_folders(str(error)))
     if isinstance(error, ObjectStoreError):
         return RequestError(503, str(error), 5)
     if isinstance(error, MapError | WeightsError | MissingExtraError):
-        return RequestError(503, str(error), 30)
+        return RequestError(503, without_folders(str(error)), 30)
     if isinstance(error, TopolocError):
         return RequestError(400 if isinstance(error, UnreadableImageError) else 422, str(error))
     if isinstance(error, MemoryError):
         return RequestError(503, "out of memory; send a smaller image, or try again later", 5)
     return RequestError(503, "the worker failed at this request; see the log of the service", 1)
+
+
+def without_folders(text: str) -> str:
+    """Leave the names of files alone. The log has the folders, which are no matter of clients."""
+    return re.sub(r"(?<![\w:/])/(?:[^\s/:]+/)+", "", text)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +18,7 @@ import tyro
 
 from topoloc import (
     AtlasConfig,
+    Gyroscope,
     Localizer,
     LocalizerConfig,
     NotLocalized,
@@ -43,6 +46,7 @@ from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.core_names import as_monocular
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.config import RobotConfig
+from topoloc.apps.robots.imu import ImuFeed, make_gyroscope, take_from_file, take_from_topic
 from topoloc.apps.robots.mavlink import DroneLocalizer, choose_origin
 from topoloc.apps.robots.robot_localizer import RobotLocalizer
 from topoloc.apps.robots.ros_images import RosImages, is_topic
@@ -69,6 +73,11 @@ class Command:
     """Topic of a bag: left=/cam0/image_raw."""
     features: QUERY_FEATURES = None
     """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
+    imu: Annotated[str | None, option("FILE|ros:TOPIC")] = None
+    """Gyroscope that bridges blurred and dark images: a CSV file (time, then rad/s about x, y and
+    z), or a topic of ROS 2. It has the clock of the images."""
+    cam_from_imu: Annotated[str | None, option("W,X,Y,Z", "found from the images")] = None
+    """Rotation from the IMU's axes to the camera's, a quaternion."""
     plain: Flag = False
     """Print readable lines instead of JSON."""
     realtime: Flag = False
@@ -113,17 +122,22 @@ class Command:
         tracking = settings.get(TrackerConfig)
         tracking = replace(tracking, simulated=self.simulated or tracking.simulated)
         with ExitStack() as stack:
-            tracker = stack.enter_context(closing(Tracker(localizer, tracking)))
+            gyroscope = self._make_gyroscope()
+            tracker = Tracker(localizer, tracking, gyroscope=gyroscope)
+            stack.enter_context(closing(tracker))
             stop = stack.enter_context(catch_stop_signals())
             of_size = None if self.camera is None else parse_camera(localizer, self.camera)
             config, node, images = self._robot_config(settings.get(RobotConfig)), None, None
-            if self.ros or is_topic(self.source):
+            if self.ros or is_topic(self.source) or is_topic(self.imu or ""):
                 node = stack.enter_context(closing(RosNode(config)))
             if node is not None and is_topic(self.source):
                 images = RosImages(node, self.source, of_size is not None, print_warning)
                 frames = images.frames(stop)
             else:
                 frames = self._open_frames(stack, stop)
+            if gyroscope is not None:
+                imu_node = node if is_topic(self.imu or "") else None
+                frames = self._open_imu(gyroscope, imu_node).feed(frames)
             robot = None
             if node is not None and self.ros:
                 robot = RobotLocalizer(node, config, images, print_warning)
@@ -159,6 +173,25 @@ class Command:
         recording = open_recording(self.source, self.format, None, self.topics)
         frames = _read_frames(as_monocular(recording))
         return _play(frames, stop) if self.realtime else frames
+
+    def _make_gyroscope(self) -> Gyroscope | None:
+        """Return the gyroscope, None if there is no IMU. Raises UsageError: options that clash."""
+        if self.imu is None:
+            if self.cam_from_imu is not None:
+                raise UsageError("--cam-from-imu needs --imu")
+            return None
+        is_recording = not (self.realtime or is_topic(self.source) or is_live(self.source))
+        if is_topic(self.imu) == is_recording:
+            kind = "FILE, and no --realtime" if is_recording else "ros:TOPIC"
+            raise UsageError(f"--imu needs the clock of the images: give --imu {kind}")
+        return make_gyroscope(self.cam_from_imu)
+
+    def _open_imu(self, gyroscope: Gyroscope, node: RosNode | None) -> ImuFeed:
+        name = self.imu or ""
+        take = take_from_file(Path(name)) if node is None else take_from_topic(node, name)
+        return ImuFeed(
+            name, gyroscope, take, lambda text: print_line(text, sys.stderr), print_warning
+        )
 
     def _check_world(self, localizer: Localizer) -> None:
         """Warn if z of the map does not point up. Raises UsageError: it has several worlds."""

@@ -21,7 +21,15 @@ from topoloc import (
     warm_up,
 )
 from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer
-from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, catch_stop_signals, option
+from topoloc.apps.cli.output import (
+    File,
+    Flag,
+    RayOption,
+    UsageError,
+    catch_stop_signals,
+    option,
+    print_warning,
+)
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ReplicasConfig
 from topoloc.apps.service.config import ServiceConfig
@@ -63,12 +71,15 @@ class ServedMaps:
         )
         if self.service.num_workers > 1:
             set_num_threads(1)
-        return MapCache.with_memory(
+        maps = MapCache.with_memory(
             self.paths,
             lambda topomap: open_localizer(topomap, self.localizer, self.features),
             self.service.memory_mb,
             TileFetcher(self.service.fetch_s).path,
         )
+        if not maps.names():
+            print_warning(f"{', '.join(self.paths)}: no map yet; copy a .topo file there")
+        return maps
 
 
 def read_token(path: str | None) -> str | None:

@@ -50,7 +50,7 @@ export class Viewer {
   addMap() {
     const { points, nodes, paths, map } = this.document;
     this.cloud = objects.cloudOf(this.points, points.rgb, 2);
-    this.layer("points", this.cloud, `${map.num_points_shown.toLocaleString("en")} points`);
+    this.layer("points", this.cloud, "points");
     const cameras = nodes.map((node) => ({ matrix: matrixOf(node.world_from_cam), camera: node.camera }));
     const frustums = objects.frustumsOf(cameras, this.depth, objects.COLOURS.node, { opacity: 0.6 });
     this.layer("nodes", frustums, `${nodes.length} nodes`, objects.COLOURS.node);

@@ -17,6 +17,7 @@ async function start() {
     state.names = await mapNames();
   } catch (error) {
     part("token-field").hidden = error.status !== 401;
+    hint(error.status === 401 ? "The map is shown once the token is entered." : "The map is not shown.");
     if (error.status === 401 && !hasToken()) return part("token").focus();
     return tellFailure(error);
   }
