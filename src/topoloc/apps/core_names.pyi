@@ -64,7 +64,8 @@ from topoloc.recordings.camera_files import (
     yaml_word as yaml_word,
 )
 from topoloc.recordings.format import complete_lists as complete_lists, read_times as read_times
-from topoloc.recordings.frame import to_grey as to_grey
+from topoloc.recordings.frame import SequenceView as SequenceView, to_grey as to_grey
+from topoloc.recordings.frame_preparation import prepare_frame as prepare_frame
 from topoloc.recordings.image_files import find_path as find_path
 from topoloc.recordings.image_io import (
     IMAGE_SUFFIXES as IMAGE_SUFFIXES,
@@ -79,6 +80,7 @@ from topoloc.recordings.recording import (
     as_monocular as as_monocular,
     has_scale as has_scale,
     keep_frames as keep_frames,
+    read_left_frame as read_left_frame,
     scale_poses as scale_poses,
 )
 from topoloc.recordings.stored_images import encode_jpeg as encode_jpeg
@@ -92,5 +94,6 @@ from topoloc.recordings.trajectory import (
     has_answers as has_answers,
     timed_trajectory as timed_trajectory,
 )
+from topoloc.slam.view_graph import match_views as match_views
 
 __all__: list[str]

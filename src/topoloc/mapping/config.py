@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Protocol, runtime_checkable
 
-from topoloc.bounds import AtLeast, drop_removed_settings, parse_settings
+from topoloc.bounds import AtLeast, Between, drop_removed_settings, parse_settings
 from topoloc.errors import ConfigError
 from topoloc.features.feature_types import (
     SURF,
@@ -56,6 +56,9 @@ class MapConfig(OneLine):
     look_alike_floors: bool = False
     """The building has other floors like this one that the map does not hold. A pose is then given
     only if the colours agree."""
+    scale_sigma: Annotated[float, Between(0, 1)] = 0.0
+    """Relative standard deviation of all lengths of the map, such as those of photos whose scale is
+    that of a printed tag."""
 
     @property
     def kinds(self) -> list[str]:
@@ -109,7 +112,10 @@ class MapConfig(OneLine):
 
     def to_json(self) -> dict[str, Any]:
         """Return the settings and their version as JSON."""
-        return {"version": CONFIG_VERSION, **asdict(self)}
+        settings = asdict(self)
+        if not self.scale_sigma:  # earlier versions do not know it
+            del settings["scale_sigma"]
+        return {"version": CONFIG_VERSION, **settings}
 
 
 def _resolved(value: float | None) -> float:

@@ -45,6 +45,8 @@ from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 if TYPE_CHECKING:
     from topoloc.apps.cluster.tiles import Outcome, TileJob
 
+_SOURCES = ("truth", "slam", "photos")  # of poses, beside files
+
 
 @dataclass(frozen=True)
 class Command:
@@ -58,31 +60,33 @@ class Command:
     PATH. With --ray each recording becomes a tile of the atlas that is named last."""
     trajectory: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
-        option("truth|slam|FILE", "truth if available, else slam"),
+        option("truth|slam|photos|FILE", "what there is"),
     ] = ()
-    """Source of the poses: `truth` (the recording's own), `slam`, or a TUM or KITTI file. Once for
-    all recordings, or once for each."""
+    """Source of the poses: `truth` (their own), `slam`, a TUM or KITTI file, or `photos` (single
+    images in any order). Once for all recordings, or for each."""
     poses: PosesOption = None
     """Conventions of the poses of truth or FILE, if they are not world_from_cam in metres with axes
     right, down, forward: inverse, opengl, flu, frd, unity, unreal, wxyz, transposed, mm, cm, feet,
     scale=FACTOR, body=X,Y,Z,QX,QY,QZ,QW (body_from_cam), shift=SECONDS, clock=FACTOR. `unchecked`:
     do not compare them with the images."""
     allow_gaps: Flag = False
-    """Map a recording if fewer than half of its frames have a pose."""
+    """Map recordings with poses for under half of the frames."""
     format: Format = None
     camera: CameraOption = None
     mask: MaskOption = None
-    images: Annotated[str | None, option("FOLDER", "images/ beside the model")] = None
+    images: Annotated[str | None, option("FOLDER", "images/ beside it")] = None
     """Images of a COLMAP model."""
     scale: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(
             metavar="METRES|IMAGE_A,IMAGE_B=METRES",
-            help_behavior_hint="(distances: may be given several times)",
+            help_behavior_hint="(distances: several times)",
         ),
     ] = ()
-    """Metres in a unit of the recordings' own poses, for models without a metric scale; or a
-    measured distance between the cameras of two images."""
+    """Metres in a unit of the poses of models without a scale; or a measured distance between the
+    cameras of two images."""
+    tag: Annotated[float | None, option("METRES")] = None
+    """Side of printed AprilTags or ArUco markers: the scale of photos."""
     topics: Topics = None
     d_thresh: Annotated[float | None, option("METRES", "from the visible depth")] = None
     """Metres between nodes (D_thresh of the paper's Eq. 1)."""
@@ -121,8 +125,10 @@ class Command:
             raise UsageError("--world, --replace, --join and --split need --ray")
         split = SplitOptions.parse(self.split)
         recordings, target = self._split_paths()
-        read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam")]
+        read = [path for path in (*self.trajectory, self.config) if path not in _SOURCES]
         check_outputs([target if self.ray is None else None, self.json], [*recordings, *read])
+        if self.tag is not None and not 0.0 < self.tag < 100.0:
+            raise UsageError(f"--tag is the side of a tag in metres, such as 0.16, not {self.tag}")
         if any("=" not in text and not _is_positive(text) for text in self.scale):
             raise UsageError(
                 "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not"
@@ -144,7 +150,7 @@ class Command:
             config = replace(config, look_alike_floors=True)
         return MapJob(
             tuple(recordings),
-            PoseOptions(self.trajectory, self.poses, self.scale, self.allow_gaps),
+            PoseOptions(self.trajectory, self.poses, self.scale, self.allow_gaps, self.tag),
             select_build_features(config, self.features),
             self.format,
             self.camera,

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from importlib.metadata import version
@@ -32,8 +32,19 @@ from topoloc import (
 )
 from topoloc.apps.cli.output import UsageError, describe_recording, open_recording, print_line
 from topoloc.apps.cluster.remote import Progress
-from topoloc.apps.core_names import has_scale, keep_frames, scale_poses, split_selection
+from topoloc.apps.core_names import (
+    find_format,
+    has_scale,
+    keep_frames,
+    scale_poses,
+    split_selection,
+)
 from topoloc.apps.formats.colmap import estimate_metric_scale
+from topoloc.apps.reconstruction.kept_back import check_kept_back
+from topoloc.apps.reconstruction.key_frames import select_key_frames
+from topoloc.apps.reconstruction.photos import reconstruct
+from topoloc.apps.reconstruction.scale import find_scale
+from topoloc.plugin import cache_folder
 
 MIN_OVERLAP = 3
 
@@ -43,13 +54,15 @@ class PoseOptions:
     """Source and conventions of poses, as the options of `topoloc build`.
 
     `trajectory` has one entry for all recordings or one for each. If it is empty, the truth is used
-    if all recordings have one, else SLAM.
+    if all recordings have one, else SLAM; `photos` if they are single images. `tag` is the side of
+    printed tags, metres.
     """
 
     trajectory: tuple[str, ...] = ()
     poses: str | None = None
     scale: tuple[str, ...] = ()
     allow_gaps: bool = False
+    tag: float | None = None
 
 
 def parse_conventions(poses: str | None) -> tuple[PoseConventions, bool]:
@@ -81,19 +94,47 @@ class MapJob:
         contradict each other or the recordings; TopolocError: see `open_sequence`, `run_slam` and
         `build_map`."""
         sequences, poses_from = self._open(tell)
-        is_slam = poses_from[0] == "slam"
+        is_slam, is_computed = poses_from[0] == "slam", poses_from[0] in ("slam", "photos")
+        build = self.build
+        if poses_from[0] == "photos":
+            sequences, scale_sigma = self._reconstruct(sequences, progress, tell)
+            build = replace(build, scale_sigma=scale_sigma)
         if is_slam:
             result = run_slam(sequences, progress, _warn)
             sequences = result.apply(sequences)
             if apart := result.num_submaps - result.num_joined:
                 _warn(f"{apart} of {result.num_submaps} sub-maps share no distinct view with any")
         for sequence in sequences:
-            if num_without := sum(pose is None for pose in sequence.poses):
+            num_without = sum(pose is None for pose in sequence.poses)
+            if num_without and poses_from[0] != "photos":
                 count = f"{num_without} of {len(sequence)}"
                 _warn(f"{sequence.name}: {count} frames have no pose and are left out")
         options = self.pose_options
-        checks = parse_conventions(options.poses)[1], not (options.allow_gaps or is_slam)
-        return build_map(sequences, self.build, progress, poses_from, *checks, _warn), poses_from
+        are_checked = parse_conventions(options.poses)[1] and poses_from[0] != "photos"
+        checks = are_checked, not (options.allow_gaps or is_computed)
+        topomap = build_map(sequences, build, progress, poses_from, *checks, _warn)
+        if poses_from[0] == "photos":
+            check_kept_back(topomap, sequences, tell, _warn)
+        return topomap, poses_from
+
+    def _reconstruct(
+        self,
+        sequences: list[StereoSequence],
+        progress: Progress,
+        tell: Callable[[str], None] | None,
+    ) -> tuple[list[StereoSequence], float]:
+        """Return single images with computed poses in metres, and the relative sigma of these."""
+        options, images = self.pose_options, replace(self, pose_options=PoseOptions())
+        measured = re.split("[,=]", ",".join(options.scale))
+        for k, path in enumerate(self.recordings):
+            if find_format(path, self.format) == "video":
+                sequences[k] = keep_frames(select_key_frames(sequences[k], measured, progress))
+        digest = replace(images, build=BuildConfig()).digest()
+        names = "\n".join([digest, *(name for one in sequences for name in one.names)])
+        work = sha256(names.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+        found = reconstruct(sequences, cache_folder() / "reconstructions" / work, progress, _warn)
+        scale = find_scale(found, options.scale, options.tag, tell)
+        return [scale_poses(one, scale.metres) for one in found.sequences], scale.sigma
 
     def split_by_recording(self) -> list[MapJob]:
         """Return one job for each recording. Raises UsageError if the number of trajectories is
@@ -143,8 +184,15 @@ class MapJob:
             for path, sequence in zip(self.recordings, sequences, strict=True):
                 tell(describe_recording(path, self.format, self.camera, sequence))
         has_truth = all(any(sequence.poses) for sequence in sequences)
-        default = ("truth" if has_truth else "slam",)
+        first = sequences[0][0]
+        is_single = first.right is None and first.depth is None
+        default = ("truth" if has_truth else "photos" if is_single else "slam",)
         trajectories = self._for_each(self.pose_options.trajectory or default)
+        if self.pose_options.tag is not None and set(trajectories) != {"photos"}:
+            raise UsageError("--tag gives the scale of images without poses (--trajectory photos)")
+        if "photos" in trajectories:
+            self._check_photo_options(trajectories)
+            return sequences, list(trajectories)
         if "slam" in trajectories:
             if self.pose_options.poses is not None:
                 raise UsageError("--poses needs given poses; slam computes its own")
@@ -155,6 +203,16 @@ class MapJob:
             return sequences, list(trajectories)
         pairs = zip(sequences, trajectories, strict=True)
         return [self._with_poses(sequence, name) for sequence, name in pairs], list(trajectories)
+
+    def _check_photo_options(self, trajectories: Sequence[str]) -> None:
+        if set(trajectories) != {"photos"}:
+            raise UsageError("--trajectory photos applies to all recordings or to none")
+        if self.pose_options.poses is not None:
+            raise UsageError("--poses needs given poses; those of photos are computed")
+        if any("=" not in text for text in self.pose_options.scale):
+            raise UsageError(
+                "--scale METRES needs the recordings' own poses; photos take a distance or --tag"
+            )
 
     def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
         conventions, _ = parse_conventions(self.pose_options.poses)
