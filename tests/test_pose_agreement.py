@@ -18,6 +18,7 @@ OTHER_TESTS = {
 # It draws triples of points. `find_least_median` compares their transforms.
 OTHER_ENGINES = {
     "apps/georeferencing/georeference_fit.py:_robust_weights",
+    "tracking/gyroscope.py:find_start",  # it calls find_least_median
     "apps/cli/maps/floor.py:_sample_normal",  # it searches a plane, no transform
 }
 _ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)

@@ -247,6 +247,20 @@ def _with_camera(best: Hypothesis, other: SeenCamera) -> Hypothesis:
     return replace(best, fit=fit, covariance=best.covariance + added)
 
 
+def widen_by_scale(query: MapQuery, answer: Answer) -> Finding | None:
+    """Add the uncertainty of the map's scale to the covariance: the whole map grows or shrinks
+    about the world's origin."""
+    pose, sigma = answer.pose, query.opened.topomap.config.scale_sigma
+    if pose is None or sigma == 0.0:
+        return None
+    covariance, shift = pose.covariance.copy(), sigma * pose.world_from_cam.translation
+    covariance[:3, :3] += np.outer(shift, shift)
+    wider = replace(pose, covariance=covariance)
+    share = pose.noise_share * (pose.position_sigma_m / wider.position_sigma_m) ** 2
+    text = f"the scale of the map is known to {100.0 * sigma:.1f} %"
+    return Finding("scale", text, facts={"covariance": covariance, "noise_share": share})
+
+
 def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:
     """Refuse a pose whose probability is below the threshold of the map's certificate, which
     looks as on another floor, or which is less precise than the tolerance."""
@@ -278,6 +292,7 @@ CHECKS: tuple[Check, ...] = (
     check_camera,
     refine_answer,
     check_colours,
+    widen_by_scale,
     check_threshold,
 )
 """All that may change an answer after the belief. `docs/architecture.md` describes each."""

@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.localization.result import Localization, NotLocalized, Reason
 
 CameraResults = Mapping[str, Localization | NotLocalized]
 
 
-@dataclass(frozen=True, eq=False)
-class RigLocalization:
+@dataclass(frozen=True, eq=False, repr=False)
+class RigLocalization(OneLine):
     """Hold the pose `world_from_rig` of a rig at one instant and its uncertainty.
 
     Attributes:
@@ -68,8 +69,8 @@ class RigLocalization:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class RigNotLocalized:
+@dataclass(frozen=True, eq=False, repr=False)
+class RigNotLocalized(OneLine):
     """Report that no pose of the rig is certain enough, with the `reason`. `cameras` and `left_out`
     are as in `RigLocalization`."""
 

@@ -75,7 +75,8 @@ class PictureOptions:
             metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: 380,380, in the middle)"
         ),
     ] = None
-    """A camera.json, or four numbers in pixels with --size."""
+    """A camera.json, four numbers in pixels with --size, or a rig.json: a recording for each of its
+    cameras."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x400"
     """Size of the pictures. Without --camera the field of view stays 80 degrees across."""
     baseline: Annotated[
@@ -85,9 +86,6 @@ class PictureOptions:
     """Metres between the left and the right camera."""
     mono: Flag = False
     """A single camera: pictures in images/, and a camera.json."""
-    rig: File = None
-    """A rig.json: one recording of single images for each camera, in the folder of its name, all
-    of the same walk. Cameras without a model take that of --camera."""
     depth: Flag = False
     """Exact depth pictures, too; with --mono this makes an RGB-D recording."""
     grey: Flag = False
@@ -100,6 +98,12 @@ class PictureOptions:
     """Average several moments of the exposure. Five times as slow."""
     draft: Flag = False
     """About ten times as fast, with rougher light."""
+
+    @property
+    def rig(self) -> Path | None:
+        """Return the file of --camera if it is that of a rig."""
+        path = Path(self.camera or "")
+        return path if path.name == "rig.json" else None
 
 
 @dataclass(frozen=True)
@@ -150,10 +154,10 @@ class Command:
         world, out = find_world(self.world), Path(self.out)
         config = self._config(world)
         check_outputs([self.json])
-        if self.picture.rig is None:
+        if (rig_file := self.picture.rig) is None:
             self._record_one(world, out, config)
             return 0
-        rig = Rig.read(self.picture.rig)
+        rig = Rig.read(rig_file)
         for name, mounted in rig.cameras.items():
             mounting = tuple(map(tuple, mounted.rig_from_cam.tolist()))
             route = replace(config.route, mounting=mounting)
@@ -193,7 +197,7 @@ class Command:
         pictures = self.picture
         is_mono = pictures.mono or pictures.rig is not None
         if is_mono and pictures.baseline is not None:
-            raise UsageError("--mono and --rig have no --baseline")
+            raise UsageError("--mono and rigs have no --baseline")
         return RecordConfig(
             seed=self.seed,
             arrangement=self.arrangement,
@@ -261,7 +265,7 @@ def _camera(pictures: PictureOptions) -> Camera:
         UsageError, CalibrationError: the options are invalid.
     """
     width, height = _size(pictures.size)
-    if pictures.camera is None:
+    if pictures.camera is None or pictures.rig is not None:
         focal = ZED.fx * width / ZED.width
         return Camera.pinhole(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     if "," in pictures.camera and not Path(pictures.camera).exists():

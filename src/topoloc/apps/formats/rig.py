@@ -7,6 +7,7 @@ Images of one instant have one name. Poses are those of the cameras' recordings,
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -206,7 +207,7 @@ def open_panoramas(path: Path) -> PanoramaRecording:
     return PanoramaRecording(panoramas, list(rig.cameras))
 
 
-FORMAT = RecordingFormat(EXPECTED_FILES, lambda path: (path / "rig.json").is_file(), open_rig)
+FORMAT = RecordingFormat(EXPECTED_FILES, lambda path: os.path.isfile(path / "rig.json"), open_rig)
 PANORAMAS = RecordingFormat(
     "panoramas of 360 x 180 degrees (--format equirectangular)", lambda path: False, open_panoramas
 )

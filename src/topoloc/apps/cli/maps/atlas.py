@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc import Atlas, Rigid3, SharedWorld, TopoMetricMap, join_tiles
+from topoloc import Atlas, join_tiles
 from topoloc.apps.cli.output import (
     File,
     Flag,
@@ -20,13 +20,9 @@ from topoloc.apps.cli.output import (
     option,
     print_fields,
     print_line,
-    print_warning,
     write_json,
 )
 from topoloc.apps.cli.settings_file import Settings, read_settings
-from topoloc.apps.core_names import WalkGraph
-
-_MAX_TILES_READ = 100  # maps that `info` opens for junctions; `--check` reads all
 
 
 @dataclass(frozen=True)
@@ -115,25 +111,7 @@ def show_atlas(atlas: Atlas, check: bool, json: str | None) -> int:
     problems = [(name, atlas.find_problem(name)) for name in atlas.select_tiles() if check]
     found = [f"tile {name}: {problem}" for name, problem in problems if problem]
     facts = describe_atlas(atlas.store.where, atlas.manifest)
-    if check or facts["num_tiles"] <= _MAX_TILES_READ:
-        worlds = SharedWorld.group(atlas.manifest)
-        facts["junctions"] = [one for world in worlds for one in _find_junctions(atlas, world)]
     return report_atlas(facts | ({"check": found or "ok"} if check else {}), json, found)
-
-
-def _find_junctions(atlas: Atlas, world: SharedWorld) -> list[dict[str, Any]]:
-    """Return the junctions of the tiles of one world as JSON, positions in this world."""
-    ids = list[dict[str, Any]]()
-
-    def read() -> Iterator[tuple[TopoMetricMap, Rigid3]]:
-        for placed, topomap in world.open_tiles(atlas, print_warning):
-            ids.extend({"tile": placed.tile.tile_id, "node": s.node_id} for s in topomap.summaries)
-            yield topomap, placed.world_from_map
-
-    return [
-        ids[one.node] | {"position": one.position.round(4).tolist(), "ways": one.num_ways}
-        for one in WalkGraph.from_maps(read()).find_junctions()
-    ]
 
 
 def report_joined(where: str, joined: JoinedTiles, json: str | None) -> int:
@@ -195,16 +173,9 @@ def _print_atlas(facts: dict[str, Any]) -> None:
             *(("", f"{tile['id']:<{width}}  {_format_tile(tile)}") for tile in facts["tiles"]),
             *(("world", f"{name}: {ids}") for name, ids in shared.items()),
             *(("join", _format_join(join)) for join in facts["joins"]),
-            *([("junctions", "none")] if facts.get("junctions") == [] else []),
-            *(("junction", _format_junction(one)) for one in facts.get("junctions", ())),
             *([("check", check)] if check else []),
         ]
     )
-
-
-def _format_junction(junction: dict[str, Any]) -> str:
-    position = ", ".join(f"{value:.1f}" for value in junction["position"])
-    return f"tile {junction['tile']}, node {junction['node']} at {position}"
 
 
 def _format_join(join: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -248,7 +249,9 @@ class Command:
     @property
     def _is_rig(self) -> bool:
         """Return whether the inputs are images of rigs."""
-        return self.rig is not None or any(Path(path, "rig.json").is_file() for path in self.inputs)
+        return self.rig is not None or any(
+            os.path.isfile(f"{path}/rig.json") for path in self.inputs
+        )
 
     @property
     def _stereo_calibration(self) -> str | None:
