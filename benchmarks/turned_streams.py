@@ -8,6 +8,8 @@ gyroscope's rates are those of the turned truth, 200 a second, in axes of its ow
 given, with the noise and the bias of a phone's (0.01 deg/s/sqrt(Hz), 1 deg/s).
 
 An image is lost if it has no pose, measured or predicted, within 0.5 m and 5 degrees of the truth.
+
+    python benchmarks/turned_streams.py (a part of `streams.py --turns`)
 """
 
 from __future__ import annotations
