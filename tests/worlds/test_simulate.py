@@ -58,6 +58,26 @@ def test_it_writes_a_recording_with_a_message(tmp_path: Path, capsys: pytest.Cap
 
 
 @pytest.mark.usefixtures("no_rendering")
+def test_a_rig_gets_a_recording_for_each_camera_of_one_walk(tmp_path: Path):
+    left = [[0.0, 0.0, -1.0, -0.1], [0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    ahead = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    rig, out = tmp_path / "rig.json", tmp_path / "walk"
+    cameras = {"ahead": {"rig_from_cam": ahead}, "left": {"rig_from_cam": left}}
+    rig.write_text(json.dumps({"cameras": cameras}))
+    assert simulate("lab", out, "--num-frames", 2, "--camera", rig) == 0
+    recording = open_sequence(out)
+    assert [name.split("/")[0] for name in recording.names] == ["ahead", "left"] * 2
+    for first in (0, 2):
+        forward, sideways = recording.poses[first], recording.poses[first + 1]
+        assert forward is not None
+        assert sideways is not None
+        assert np.allclose((forward.inverse() @ sideways).matrix()[:3], left, atol=1e-6)
+        own = open_sequence(out / "left").poses[first // 2]
+        assert own is not None
+        assert np.allclose(own.matrix(), sideways.matrix(), atol=1e-6)
+
+
+@pytest.mark.usefixtures("no_rendering")
 def test_settings_reach_the_recording(tmp_path: Path):
     words = (
         "--num-frames 2 --condition clear --seed 3 --take 4 --arrangement 5 --lateral 0.1 --reverse"

@@ -70,12 +70,14 @@ class RigLocalizer:
 
     def _localize_each(self, images: Mapping[str, Image], deadline: Deadline | None) -> _Results:
         sure = 0.95  # least probability of a pose that is the prior of other cameras
-        results, leader = _Results(), None
+        results, near_leader, leader = _Results(), list[str](), None
         for name, image in images.items():
             results[name] = self._localize_one(name, image, leader, deadline)
-            if leader is None:
-                found = list(self._estimates(name, results[name]))
-                leader = next((one for one in found if one.probability >= sure), None)
+            if leader is not None:
+                near_leader.append(name)
+                continue
+            found = self._estimates(name, results[name])
+            leader = next((one for one in found if one.probability >= sure), None)
         if leader is None:
             return results
         confirmed = any(
@@ -84,10 +86,9 @@ class RigLocalizer:
             if name != leader.camera
             for one in self._estimates(name, of)
         )
-        if not confirmed:
-            for name, of in results.items():
-                if name != leader.camera and not of.localized:
-                    results[name] = self._localize_one(name, images[name], None, deadline)
+        for name in () if confirmed else near_leader:
+            if not results[name].localized:
+                results[name] = self._localize_one(name, images[name], None, deadline)
         return results
 
     def _localize_one(

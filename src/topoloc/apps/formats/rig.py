@@ -8,7 +8,9 @@ Images of one instant have one name. Poses are those of the cameras' recordings,
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from topoloc import (
     Image,
     RecordingError,
     Rig,
+    RigCamera,
     Rigid3,
     StereoFrame,
     StereoSequence,
@@ -155,56 +158,57 @@ def open_rig(path: Path) -> RigRecording:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PanoramaRecording(IndexedFrames):
-    """A StereoSequence of the views of panoramas, whose poses have z to the centre of the image."""
+    """A StereoSequence of the views of panoramas, whose poses have z to the centre of the image.
+
+    `mounted` are the views of a panorama. `cut` returns the images of a panorama's views by its
+    row; it keeps the last ones, because the views of a panorama are read one after the other.
+    """
 
     panoramas: StereoSequence
-    views: list[str]
+    mounted: Mapping[str, RigCamera]
+    cut: Callable[[int], tuple[Rig, dict[str, Image]]]
+    names: list[str]
+    t_ns: list[int]
+    poses: list[Rigid3 | None]
 
     @property
     def name(self) -> str:
         """Return the name of the folder."""
         return self.panoramas.name
 
-    @property
-    def names(self) -> list[str]:
-        """Return image and view of each frame."""
-        return [f"{view}/{name}" for name in self.panoramas.names for view in self.views]
-
-    @property
-    def t_ns(self) -> list[int]:
-        """Return the time of each frame; the views of a panorama differ by a nanosecond."""
-        return [t + k for t in self.panoramas.t_ns for k in range(len(self.views))]
-
-    @property
-    def poses(self) -> list[Rigid3 | None]:
-        """Return the pose of each view."""
-        rig, _ = cut_panorama(self.panoramas[0].image)
-        turns = [rig.cameras[view].rig_from_cam for view in self.views]
-        return [None if one is None else one @ by for one in self.panoramas.poses for by in turns]
-
     def __len__(self) -> int:
-        return len(self.panoramas) * len(self.views)
+        return len(self.names)
 
     def read_frame(self, row: int) -> StereoFrame:
-        """Read one view. Raises UnreadableImageError, QueryError: no panorama."""
-        instant, k = divmod(row, len(self.views))
-        frame, view = self.panoramas[instant], self.views[k]
-        rig, images = cut_panorama(frame.image)
-        mounted, pose = rig.cameras[view], frame.world_from_cam
+        """Read one view. Raises UnreadableImageError; QueryError: no panorama."""
+        instant, k = divmod(row, len(self.mounted))
+        view = list(self.mounted)[k]
+        rig, images = self.cut(instant)
+        camera, pose = rig.cameras[view].camera, self.poses[row]
         return StereoFrame(
-            f"{view}/{frame.name}",
-            frame.t_ns + k,
-            images[view],
-            mounted.camera,
-            world_from_cam=None if pose is None else pose @ mounted.rig_from_cam,
+            self.names[row], self.t_ns[row], images[view], camera, world_from_cam=pose
         )
 
 
 def open_panoramas(path: Path) -> PanoramaRecording:
-    """Open a folder of equirectangular images. Raises RecordingError: it cannot be read."""
+    """Open a folder of equirectangular images. Raises RecordingError: it cannot be read;
+    QueryError: the first image is no panorama."""
     panoramas = as_monocular(open_sequence(path))
-    rig, _ = cut_panorama(panoramas[0].image)
-    return PanoramaRecording(panoramas, list(rig.cameras))
+
+    @lru_cache(maxsize=2)
+    def cut(row: int) -> tuple[Rig, dict[str, Image]]:
+        return cut_panorama(panoramas[row].image)
+
+    mounted = cut(0)[0].cameras
+    turns = [one.rig_from_cam for one in mounted.values()]
+    return PanoramaRecording(
+        panoramas,
+        mounted,
+        cut,
+        [f"{view}/{name}" for name in panoramas.names for view in mounted],
+        [t_ns + k for t_ns in panoramas.t_ns for k in range(len(turns))],
+        [None if one is None else one @ by for one in panoramas.poses for by in turns],
+    )
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, lambda path: os.path.isfile(path / "rig.json"), open_rig)

@@ -66,6 +66,6 @@ def _localize(
         result = localizer.localize(frame.image, frame.camera)
         if isinstance(result, Localization) and frame.world_from_cam is not None:
             step = frame.world_from_cam.inverse() @ result.world_from_cam
-            metres, turned = np.linalg.norm(step.translation), np.linalg.norm(step.log()[3:])
-            errors.append((float(metres), float(np.rad2deg(turned))))
+            metres = float(np.linalg.norm(step.translation))
+            errors.append((metres, float(np.rad2deg(step.angle()))))
     return errors

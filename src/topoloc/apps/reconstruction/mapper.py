@@ -27,7 +27,7 @@ def main(folder: Path) -> None:
 
     `poses.npz` holds for each image its part (0 is the largest; -1 without a pose),
     `cam_from_world` (n, 3, 4) in an arbitrary unit, and its camera as JSON; and of the points that
-    images of part 0 see: row of the image, pixel (COLMAP's centre), depth and reprojection error.
+    images of part 0 see: row of the image, pixel (COLMAP's centre) and depth.
     """
     import pycolmap
 
