@@ -51,7 +51,7 @@ judge: kernels
 	@$(BIN)/python benchmarks/judge.py
 
 lint: $(VENV)/installed-test
-	@$(BIN)/ruff check --quiet
+	@$(BIN)/ruff check --no-cache --quiet
 	@$(BIN)/ruff format --check --quiet || { $(BIN)/ruff format --check; exit 1; }
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.txt || { cat $(VENV)/lint-imports.txt; exit 1; }
 	@$(PYRIGHT)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_rigs import NAMES, instant, lab_map
 
+from made_rigs import NAMES, instant, lab_map
 from topoloc import (
     Localizer,
     QueryError,
