@@ -81,3 +81,21 @@ def test_poses_that_scatter_show_that_their_errors_are_not_common():
     error = np.array([0.015, 0, 0, 0, 0, 0])
     assert error @ np.linalg.solve(covariance, error) < 6.0
     assert covariance[0, 0] > 0.5 * COVARIANCE[0, 0]
+
+
+def test_a_pose_tried_for_a_refused_image_decides_between_two_cameras():
+    against = [_estimate("a", HERE, 0.9), _estimate("b", THERE, 0.99)]
+    likelier, other = weigh_poses(against)
+    assert not likelier.outvotes(other)
+    best, rival = weigh_poses(against, [_estimate("c", HERE, 0.1)])
+    assert best.cameras == {"a", "c"}
+    assert best.outvotes(rival)
+    assert best.probability > 0.8
+    # a pose that agrees with both decides nothing
+    vague = replace(_estimate("c", HERE, 0.1), covariance=diagonal_covariance(5.0, 5.0))
+    best, rival = weigh_poses(against, [vague])
+    assert not best.outvotes(rival)
+    assert not rival.outvotes(best)
+    # nor does it make a pose of one camera likelier
+    [alone] = weigh_poses([_estimate("a", HERE, 0.6)], [_estimate("c", HERE, 0.4)])
+    assert alone.probability == pytest.approx(0.6)

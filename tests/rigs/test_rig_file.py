@@ -109,3 +109,13 @@ def test_views_of_a_panorama_show_the_rays_of_their_cameras():
 def test_an_image_of_another_shape_is_no_panorama():
     with pytest.raises(QueryError, match="twice as wide as high, not 640x400"):
         cut_panorama(np.zeros((400, 640), np.uint8))
+
+
+def test_sigmas_of_mountings_are_kept_and_are_root_mean_squares(tmp_path: Path):
+    mounted = RigCamera(Rigid3.identity(), None, 0.03, 0.6)
+    again = Rig.read(_write(tmp_path, Rig({"a": mounted, "b": mounted}).to_json())).cameras["b"]
+    assert (again.position_sigma_m, again.rotation_sigma_deg) == (0.03, 0.6)
+    assert np.sqrt(np.trace(again.covariance[:3, :3])) == pytest.approx(0.03)
+    assert np.rad2deg(np.sqrt(np.trace(again.covariance[3:, 3:]))) == pytest.approx(0.6)
+    with pytest.raises(CalibrationError, match="position_sigma_m"):
+        Rig.read(_write(tmp_path, {"cameras": {"a": {"position_sigma_m": -1}}}))

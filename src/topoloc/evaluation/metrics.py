@@ -31,6 +31,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.certificate import Difficulty, Quarter
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image
+from topoloc.rigs.rig_result import RigLocalization, RigNotLocalized
 
 # A query is recalled if its pose error is within both (metres, degrees). Recall counts all queries.
 RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
@@ -55,6 +56,7 @@ class EvaluatedQuery(OneLine):
     - `angle_deg` is the angle between the true pose and the nearest node, `light_ratio` the largest
       ratio, 1 or more, of grey level, red and blue of the query and the likest node there. NaN if
       unknown.
+    - `of_rig` is the result of a rig, whose pose is then that of `result`. Else None.
     """
 
     MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
@@ -72,6 +74,7 @@ class EvaluatedQuery(OneLine):
     is_in_other_world: bool = False
     angle_deg: float = math.nan
     light_ratio: float = math.nan
+    of_rig: RigLocalization | RigNotLocalized | None = None
 
     def difficulty(self, by: Difficulty) -> float:
         """Return the value by which quarters and groups are ordered, NaN if unknown."""
@@ -136,9 +139,10 @@ class EvaluatedQuery(OneLine):
         """Return the result's JSON with its recording and its ground truth, which is null for an
         out-of-map image."""
         truth = None if self.world_from_cam is None else self.world_from_cam.to_json()
-        return self.result.to_json(self.query) | {
+        result, of = (self.result, "cam") if self.of_rig is None else (self.of_rig, "rig")
+        return result.to_json(self.query) | {
             "recording": self.recording,
-            "true_world_from_cam": truth,
+            f"true_world_from_{of}": truth,
         }
 
 
@@ -173,6 +177,7 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     first = [(a, a.result.candidates[0].node_id if a.result.candidates else None) for a in ranked]
     hits = [node == a.nearest_node_id for a, node in first]
     near = [node == a.nearest_node_id or node in a.neighbour_ids for a, node in first]
+    left_out = Counter(name for a in answers if a.of_rig for name in a.of_rig.left_out)
     reasons = [a.result.reason for a in answers if isinstance(a.result, NotLocalized)]
     return {
         "num_queries": len(with_truth),
@@ -197,6 +202,7 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
         "num_elsewhere": len(answers) - len(with_truth),
         "false_accepts": sum(a.is_false_accept for a in answers),
         "not_localized": dict(sorted(Counter(reasons).items())),
+        **({"left_out": dict(sorted(left_out.items()))} if left_out else {}),
         "median_times_ms": {
             stage: _median(np.array([a.result.times_ms.get(stage, 0.0) for a in answers]))
             for stage in sorted({stage for a in answers for stage in a.result.times_ms})

@@ -32,6 +32,9 @@ from topoloc.mapping.storage.entries import Illumination
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
+from topoloc.rigs.rig import RigFrame
+from topoloc.rigs.rig_localizer import RigLocalizer
+from topoloc.rigs.rig_result import as_image
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -147,20 +150,21 @@ def localize_queries(
         if pose is None:
             raise TrajectoryError(f"{answer.query}: no known pose to judge against")
         world_from_cam = pose if map_from_truth is None else map_from_truth @ pose
-        distances = node_distances(world_from_cam, nodes, topomap.config.lambda_rot)
-        nearest = topomap.summaries[int(np.argmin(distances))]
-        reach = max(NEIGHBOUR_RADIUS * topomap.config.d_thresh, float(distances.min()))
-        with localizer.in_tile(tile_id) as in_tile:
-            rows = as_rows(np.flatnonzero(distances <= reach).tolist())
-            light_ratio = _find_light_ratio(frame.image, in_tile.topomap, rows, lights)
-        answer = replace(
-            answer,
-            world_from_cam=world_from_cam,
-            nearest_node_id=nearest.node_id,
-            neighbour_ids=find_neighbour_ids(topomap, distances),
-            angle_deg=math.degrees(rotation_error(world_from_cam, nearest.world_from_cam)),
-            light_ratio=light_ratio,
-        )
+        answer = replace(answer, world_from_cam=world_from_cam)
+        if not isinstance(frame, RigFrame):  # a rig looks in several directions
+            distances = node_distances(world_from_cam, nodes, topomap.config.lambda_rot)
+            nearest = topomap.summaries[int(np.argmin(distances))]
+            reach = max(NEIGHBOUR_RADIUS * topomap.config.d_thresh, float(distances.min()))
+            with localizer.in_tile(tile_id) as in_tile:
+                rows = as_rows(np.flatnonzero(distances <= reach).tolist())
+                light_ratio = _find_light_ratio(frame.image, in_tile.topomap, rows, lights)
+            answer = replace(
+                answer,
+                nearest_node_id=nearest.node_id,
+                neighbour_ids=find_neighbour_ids(topomap, distances),
+                angle_deg=math.degrees(rotation_error(world_from_cam, nearest.world_from_cam)),
+                light_ratio=light_ratio,
+            )
         answers.append(_to_answered_world(localizer, answer, tile_id))
         if progress:
             progress(label, done + 1, len(frames))
@@ -264,6 +268,10 @@ def _localize(
     localizer: Localizer, frame: StereoFrame, read_image: Callable[[], Image], label: str
 ) -> EvaluatedQuery:
     """Localize a frame. Return the result without ground truth."""
+    if isinstance(frame, RigFrame):
+        of_rig = RigLocalizer(localizer, frame.mounted).localize(frame.images)
+        named = EvaluatedQuery(frame.name, as_image(of_rig), None, recording=label)
+        return replace(named, read_image=read_image, of_rig=of_rig)
     if frame.camera is None:
         raise CalibrationError(
             f"{frame.name}: no calibration; put a camera.json into the recording's folder"

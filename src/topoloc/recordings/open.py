@@ -95,11 +95,7 @@ def open_sequence(
     if warn is not None:
         for note in recording_notes(sequence):
             warn(note)
-    if selection is not None:
-        indices = parse_selection(selection, len(sequence))
-        if not indices:
-            raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
-        sequence = sequence_subset(sequence, indices)
+    sequence = select_frames(sequence, selection)
     if mask is not None:
         sequence = mask_recording(sequence, read_mask(mask))
     if not whole_only:
@@ -185,6 +181,18 @@ def split_selection(path: str) -> tuple[Path, str | None]:
     return (
         (whole, None) if not at or os.path.exists(whole) else (find_path(Path(folder)), selection)
     )
+
+
+def select_frames(sequence: StereoSequence, selection: str | None) -> StereoSequence:
+    """Return the frames of a selection, None: all. Raises RecordingError: it is malformed, or
+    selects no frame."""
+    if selection is None:
+        return sequence
+    if not (indices := parse_selection(selection, len(sequence))):
+        raise RecordingError(
+            f"{sequence.name}@{selection}: none of the {len(sequence)} frames is chosen"
+        )
+    return sequence_subset(sequence, indices)
 
 
 def parse_selection(text: str, num_frames: int) -> list[int]:

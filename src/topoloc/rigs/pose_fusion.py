@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -48,16 +48,39 @@ class PoseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class RigHypothesis:
-    """Hold the estimates of cameras that agree, the best first, and the probability of their
-    pose."""
+    """Hold the estimates of cameras that agree, the best first, and the probability of their pose.
+    `seconded` are refused cameras whose images suggest it, too."""
 
     estimates: tuple[PoseEstimate, ...]
     probability: float
+    seconded: frozenset[str] = frozenset()
+
+    @property
+    def cameras(self) -> frozenset[str]:
+        """Return the names of all cameras for this pose."""
+        return self.seconded.union(one.camera for one in self.estimates)
+
+    def outvotes(self, other: RigHypothesis) -> bool:
+        """Return whether more cameras are for this pose alone than for another one alone."""
+        return len(self._without(other)) > len(other._without(self))
+
+    def _without(self, other: RigHypothesis) -> frozenset[str]:
+        """Return the cameras for this pose that exclude the other one."""
+        pose = other.estimates[0]
+        excluding = frozenset(one.camera for one in self.estimates if not one.agrees(pose))
+        return excluding | (self.seconded - other.seconded)
 
 
-def weigh_poses(estimates: Sequence[PoseEstimate]) -> list[RigHypothesis]:
-    """Return the distinct poses of the rig by their probability, highest first."""
-    mounted_wrongly = 0.01  # least probability that a camera's sure pose is not the rig's
+def weigh_poses(
+    estimates: Sequence[PoseEstimate], tried: Sequence[PoseEstimate] = ()
+) -> list[RigHypothesis]:
+    """Return the distinct poses of the rig by their probability, highest first.
+
+    `tried` are poses that the images of refused cameras suggest. They do not make any pose of the
+    rig likely, but divide the probability between poses that contradict each other.
+    """
+    mounted_wrongly = 0.1  # least probability that a camera's sure pose is not the rig's
+    by_chance = 0.01  # probability that a wrong pose of another camera is at the same place
     of_camera = dict[str, list[PoseEstimate]]()
     for one in estimates:
         of_camera.setdefault(one.camera, []).append(one)
@@ -75,13 +98,27 @@ def weigh_poses(estimates: Sequence[PoseEstimate]) -> list[RigHypothesis]:
             agreeing += [] if best is None else [best]
         agreeing.sort(key=lambda one: float(np.trace(one.covariance[:3, :3])))
         scored.append((score, tuple(agreeing)))
-    scored.sort(key=lambda pair: -pair[0])
-    distinct = list[tuple[float, tuple[PoseEstimate, ...]]]()
+    scored.sort(key=lambda pair: (-len(pair[1]), -pair[0]))
+    distinct = list[tuple[float, RigHypothesis]]()
     for score, agreeing in scored:
-        if not any(set(agreeing) & set(others) for _, others in distinct):
-            distinct.append((score, agreeing))
-    total = sum(score for score, _ in distinct) + float(np.prod(list(none.values())))
-    return [RigHypothesis(agreeing, score / total) for score, agreeing in distinct]
+        if not any(set(agreeing) & set(others.estimates) for _, others in distinct):
+            distinct.append((score, _second(agreeing, tried)))
+    total = sum(score for score, _ in distinct)
+    known = total / (total + float(np.prod(list(none.values()))))
+    odds = [score * by_chance ** -len(one.cameras) for score, one in distinct]
+    weighed = [
+        replace(one, probability=known * of / sum(odds))
+        for of, (_, one) in zip(odds, distinct, strict=True)
+    ]
+    return sorted(weighed, key=lambda one: -one.probability)
+
+
+def _second(agreeing: tuple[PoseEstimate, ...], tried: Sequence[PoseEstimate]) -> RigHypothesis:
+    cameras = {one.camera for one in agreeing}
+    seconded = {
+        one.camera for one in tried if one.camera not in cameras and one.agrees(agreeing[0])
+    }
+    return RigHypothesis(agreeing, 0.0, frozenset(seconded))
 
 
 def fuse_poses(estimates: Sequence[PoseEstimate]) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:

@@ -10,23 +10,35 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from msgspec import Struct
 
 from topoloc.errors import CalibrationError, QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.json_data import OneLine, decode_json
+from topoloc.geometry.transform_consensus import diagonal_covariance
+from topoloc.json_data import NonNegative, OneLine, decode_json
 from topoloc.recordings.camera_files import read_camera_json
+from topoloc.recordings.frame import Image, StereoFrame
 from topoloc.recordings.text_files import read_text
+
+_SIGMAS = ("position_sigma_m", "rotation_sigma_deg")
 
 
 @dataclass(frozen=True, repr=False)
 class RigCamera(OneLine):
-    """Hold the mounting of a camera (metres) and its model, None: not calibrated."""
+    """Hold the mounting of a camera (metres) and its model, None: not calibrated. The sigmas are
+    root mean square errors of the mounting."""
 
     rig_from_cam: Rigid3
     camera: Camera | None = None
+    position_sigma_m: float = 0.0
+    rotation_sigma_deg: float = 0.0
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "6 6"]:
+        """Return that of the mounting, about each axis alike (m, rad)."""
+        return diagonal_covariance(self.position_sigma_m, self.rotation_sigma_deg) / 3.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,7 +61,8 @@ class Rig(OneLine):
 
         A mounting is `rig_from_cam` or `cam_from_rig`: rows of a 3x4 or 4x4 matrix, or translation
         (metres) and quat_wxyz. `camera` is the content of a camera.json, or the path of one from
-        here; without it the camera is not calibrated.
+        here; without it the camera is not calibrated. `position_sigma_m` and `rotation_sigma_deg`
+        are the uncertainty of a mounting, 0 by default.
 
         Raises:
             CalibrationError: the file is missing or has another content.
@@ -67,15 +80,29 @@ class Rig(OneLine):
             "cameras": {
                 name: {"rig_from_cam": one.rig_from_cam.to_json()}
                 | ({} if one.camera is None else {"camera": one.camera.to_json()})
+                | {key: of for key in _SIGMAS if (of := getattr(one, key))}
                 for name, one in self.cameras.items()
             }
         }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class RigFrame(StereoFrame):
+    """Hold the images of a rig at one instant by the names of their cameras.
+
+    `image` and `camera` are those of one of them. `world_from_cam` is the pose of the rig.
+    """
+
+    mounted: Rig
+    images: Mapping[str, Image]
 
 
 class _MountedCamera(Struct, frozen=True, forbid_unknown_fields=True):
     rig_from_cam: Rigid3 | None = None
     cam_from_rig: Rigid3 | None = None
     camera: dict[str, Any] | str | None = None
+    position_sigma_m: NonNegative = 0.0
+    rotation_sigma_deg: NonNegative = 0.0
 
     def mounted(self, name: str, folder: Path) -> RigCamera:
         """Raises CalibrationError: no mounting or two, or the camera's model cannot be read."""
@@ -85,11 +112,12 @@ class _MountedCamera(Struct, frozen=True, forbid_unknown_fields=True):
         if mounting is None:
             assert self.cam_from_rig is not None
             mounting = self.cam_from_rig.inverse()
-        if isinstance(self.camera, str):
-            return RigCamera(mounting, read_camera_json(folder / self.camera).camera)
-        if self.camera is None:
-            return RigCamera(mounting)
-        return RigCamera(mounting, Camera.from_json(self.camera, name))
+        camera = self.camera
+        if isinstance(camera, str):
+            camera = read_camera_json(folder / camera).camera
+        elif camera is not None:
+            camera = Camera.from_json(camera, name)
+        return RigCamera(mounting, camera, self.position_sigma_m, self.rotation_sigma_deg)
 
 
 class _RigFile(Struct, frozen=True, forbid_unknown_fields=True):

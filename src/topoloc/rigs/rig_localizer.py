@@ -11,15 +11,17 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.errors import QueryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import Deadline
+from topoloc.localization.query import Deadline, QueryImage, camera_of
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.search import Trace
 from topoloc.recordings.frame import Image
 from topoloc.rigs.pose_fusion import PoseEstimate, RigHypothesis, fuse_poses, weigh_poses
-from topoloc.rigs.rig import Rig, RigCamera
+from topoloc.rigs.rig import Rig
 from topoloc.rigs.rig_result import RigLocalization, RigNotLocalized
 
 _LEAD = math.exp(2.0)  # least ratio of the probability to that of another pose, as for one image
@@ -59,96 +61,160 @@ class RigLocalizer:
         limit = self.localizer.config.max_ms if max_ms is None else max_ms
         deadline = Deadline.from_limit(limit)
         seen = {name: images[name] for name in self.rig.cameras if name in images}
-        results = self._localize_each(seen, deadline)
+        tried = dict[str, list[PoseEstimate]]()
+        results = self._localize_each(seen, deadline, tried)
         estimates = [one for name, of in results.items() for one in self._estimates(name, of)]
         left_out = {name: "its image is uniform" for name, of in seen.items() if np.std(of) < 2.0}
-        ranked = weigh_poses(estimates)
-        if len(ranked) > 1 and (swap := self._find_swap(results, ranked)):
+        refused = [
+            one
+            for name, of in tried.items()
+            for one in of
+            if not results[name].localized and name not in left_out
+        ]
+        ranked = weigh_poses(estimates, refused)
+        if len(ranked) > 1 and (swap := self._find_swap(estimates, refused, ranked[0])):
             ranked, swapped = swap
             left_out |= swapped
         return self._decide(results, ranked, left_out)
 
-    def _localize_each(self, images: Mapping[str, Image], deadline: Deadline | None) -> _Results:
+    def _localize_each(
+        self,
+        images: Mapping[str, Image],
+        deadline: Deadline | None,
+        tried: dict[str, list[PoseEstimate]],
+    ) -> _Results:
         sure = 0.95  # least probability of a pose that is the prior of other cameras
+        queries = {name: self._query(name, image) for name, image in images.items()}
         results, near_leader, leader = _Results(), list[str](), None
-        for name, image in images.items():
-            results[name] = self._localize_one(name, image, leader, deadline)
+        for name in self._order(queries, sure):
+            results[name] = self._localize_one(name, queries[name], leader, deadline, tried)
             if leader is not None:
                 near_leader.append(name)
                 continue
             found = self._estimates(name, results[name])
             leader = next((one for one in found if one.probability >= sure), None)
+        results = {name: results[name] for name in images}
         if leader is None:
             return results
         confirmed = any(
             one.agrees(leader)
             for name, of in results.items()
             if name != leader.camera
-            for one in self._estimates(name, of)
+            for one in (*self._estimates(name, of), *tried.get(name, ()))
         )
         for name in () if confirmed else near_leader:
-            if not results[name].localized:
-                results[name] = self._localize_one(name, images[name], None, deadline)
+            # of three cameras, two outvote one: it is worth the time of a full search
+            is_worth = len(images) > 2 or self._is_known(queries[name])
+            if not results[name].localized and is_worth:
+                results[name] = self._localize_one(name, queries[name], None, deadline, tried)
         return results
 
-    def _localize_one(
-        self, name: str, image: Image, near: PoseEstimate | None, deadline: Deadline | None
-    ) -> Localization | NotLocalized:
-        of, prior = self.rig.cameras[name], None
-        if near is not None:
-            prior = near.world_from_rig @ of.rig_from_cam
-        tile = None if near is None else near.tile
+    def _query(self, name: str, image: Image) -> QueryImage:
+        """Return the image with its camera, which caches its features."""
         try:
-            return self.localizer.localize(image, of.camera, prior, deadline, tile_id=tile)
+            return QueryImage(image, camera_of(image, self.rig.cameras[name].camera))
         except QueryError as error:
             raise QueryError(f"{name}: {error}") from None
 
-    def _estimates(
-        self, name: str, result: Localization | NotLocalized, mounting: RigCamera | None = None
-    ) -> Iterator[PoseEstimate]:
+    def _order(self, queries: Mapping[str, QueryImage], sure: float) -> list[str]:
+        """Return the cameras, first the one whose first hypothesis is sure: its pose makes the
+        others quick, and a camera that sees nothing known is slow alone."""
+        for name in queries if len(queries) > 1 else ():
+            if self._is_known(queries[name], sure):
+                return sorted(queries, key=lambda other: other != name)
+        return list(queries)
+
+    def _is_known(self, query: QueryImage, least: float = 0.0) -> bool:
+        """Return whether the first hypothesis is a pose, of this probability or more."""
+        first = self.localizer.localize_query(query, max_ms=0.0)[0]
+        return isinstance(first, Localization) and first.probability >= least
+
+    def _localize_one(
+        self,
+        name: str,
+        query: QueryImage,
+        near: PoseEstimate | None,
+        deadline: Deadline | None,
+        tried: dict[str, list[PoseEstimate]],
+    ) -> Localization | NotLocalized:
+        """Localize an image, and add the poses that it suggested to those `tried`."""
+        prior, tile, trace = None, None, Trace()
+        if near is not None:
+            prior, tile = near.world_from_rig @ self.rig.cameras[name].rig_from_cam, near.tile
+        result = self.localizer.localize_query(query, prior, deadline, trace, tile)[0]
+        if tile is not None or len(self.localizer.tile_ids) == 1:  # else of any tile
+            tried.setdefault(name, []).extend(
+                self._estimate(name, one.world_from_cam, one.covariance, 1.0, one.probability, tile)
+                for one in (proposal.hypothesis for proposal in trace.tried)
+                if one is not None
+            )
+        return result
+
+    def _estimates(self, name: str, result: Localization | NotLocalized) -> Iterator[PoseEstimate]:
         """Yield the poses of the rig that a camera's result allows."""
-        rig_from_cam = (mounting or self.rig.cameras[name]).rig_from_cam
-        cam_from_rig = rig_from_cam.inverse()
         if isinstance(result, Localization):
             covariance, tile = result.camera_covariance, result.provenance.tile
-            found = [(result.world_from_cam, covariance, result.probability, tile)]
-            share = result.noise_share
-        else:
-            share = 1.0
-            found = [
-                (
-                    one.world_from_cam,
-                    one.world_from_cam.inverse().transform_covariance(one.covariance),
-                    one.probability,
-                    one.tile,
-                )
-                for one in result.alternatives
-                if one.covariance is not None
-            ]
-        for world_from_cam, covariance, probability, tile in found:
-            in_rig = rig_from_cam.transform_covariance(covariance)
-            pose = world_from_cam @ cam_from_rig
-            yield PoseEstimate(name, pose, in_rig, share, probability, tile)
+            of = result.noise_share, result.probability, tile
+            yield self._estimate(name, result.world_from_cam, covariance, *of)
+            return
+        for one in result.alternatives:
+            if one.covariance is not None:
+                covariance = one.world_from_cam.inverse().transform_covariance(one.covariance)
+                of = 1.0, one.probability, one.tile
+                yield self._estimate(name, one.world_from_cam, covariance, *of)
+
+    def _estimate(
+        self,
+        name: str,
+        world_from_cam: Rigid3,
+        covariance: Float[np.ndarray, "6 6"],
+        noise_share: float,
+        probability: float,
+        tile: str | None,
+    ) -> PoseEstimate:
+        """Return a pose of a camera, whose covariance has its axes, as a pose of the rig."""
+        mounting = self.rig.cameras[name]
+        in_rig = mounting.rig_from_cam.transform_covariance(covariance + mounting.covariance)
+        pose = world_from_cam @ mounting.rig_from_cam.inverse()
+        return PoseEstimate(name, pose, in_rig, noise_share, probability, tile)
 
     def _find_swap(
-        self, results: _Results, ranked: Sequence[RigHypothesis]
+        self,
+        estimates: Sequence[PoseEstimate],
+        refused: Sequence[PoseEstimate],
+        best: RigHypothesis,
     ) -> tuple[list[RigHypothesis], dict[str, str]] | None:
-        """Return the poses with the images of two cameras exchanged, if all localized cameras then
-        agree, and what is wrong. None if no exchange does."""
-        localized = [name for name, one in results.items() if isinstance(one, Localization)]
-        for a, b in combinations(localized, 2):
-            other = {a: b, b: a}
-            weighed = weigh_poses(
-                [
-                    replace(one, camera=name)
-                    for name, of in results.items()
-                    for one in self._estimates(name, of, self.rig.cameras[other.get(name, name)])
-                ]
-            )
-            if len(weighed) == 1 < len(ranked):
-                text = "its image is that of {}: swapped"
-                return weighed, {a: text.format(b), b: text.format(a)}
-        return None
+        """Return the poses with the images of two cameras exchanged, if more cameras then agree,
+        these two with them, and what is wrong. None if no exchange does."""
+        seen = dict.fromkeys(one.camera for one in (*estimates, *refused))
+        found = list[tuple[int, str, str, list[RigHypothesis]]]()
+        for a, b in combinations(seen, 2):
+            weighed = weigh_poses(self._exchange(estimates, a, b), self._exchange(refused, a, b))
+            found.append((len(weighed[0].cameras), a, b, weighed))
+        most = max((votes for votes, *_ in found), default=0)
+        likeliest = [(a, b, weighed) for votes, a, b, weighed in found if votes == most]
+        # two cameras alone may agree by several exchanges
+        if len(likeliest) != 1 or most <= len(best.cameras):
+            return None
+        a, b, weighed = likeliest[0]
+        if not {a, b} <= weighed[0].cameras:
+            return None
+        text = "its image is that of {}: swapped"
+        return weighed, {a: text.format(b), b: text.format(a)}
+
+    def _exchange(self, estimates: Sequence[PoseEstimate], a: str, b: str) -> list[PoseEstimate]:
+        """Return the poses of the rig if the images of two cameras are those of each other."""
+        exchanged, other = list[PoseEstimate](), {a: b, b: a}
+        for one in estimates:
+            if one.camera in other:
+                own = self.rig.cameras[one.camera].rig_from_cam
+                other_mounting = self.rig.cameras[other[one.camera]].rig_from_cam
+                moved = own @ other_mounting.inverse()
+                covariance = moved.inverse().transform_covariance(one.covariance)
+                pose = one.world_from_rig @ moved
+                one = replace(one, world_from_rig=pose, covariance=covariance)
+            exchanged.append(one)
+        return exchanged
 
     def _decide(
         self, results: _Results, ranked: Sequence[RigHypothesis], left_out: dict[str, str]
@@ -164,7 +230,12 @@ class RigLocalizer:
         if len(used) == 1 and isinstance(alone, NotLocalized):  # no other camera confirms it
             return RigNotLocalized(alone.reason, alone.detail, results, left_out)
         rival = ranked[1].probability if len(ranked) > 1 else 0.0
-        if best.probability < max(least, _LEAD * rival):
+        is_outvoted = any(
+            not best.outvotes(other)
+            and any(results[one.camera].localized for one in other.estimates)
+            for other in ranked[1:]
+        )
+        if is_outvoted or best.probability < max(least, _LEAD * rival):
             places = "; ".join(" and ".join(one.camera for one in of.estimates) for of in ranked)
             detail = f"the cameras show different places: {places}"
             return RigNotLocalized("ambiguous", detail, results, left_out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -88,6 +89,30 @@ class RigNotLocalized(OneLine):
         """Return one line of the result file, see docs/cli.md."""
         refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail}
         return refusal | _cameras_json(self)
+
+
+def as_image(result: RigLocalization | RigNotLocalized) -> Localization | NotLocalized:
+    """Return the result as that of one image at the frame of the rig. Node, counts and origin are
+    those of the camera with the most inliers, times are the sums of all."""
+    parts = list(result.cameras.values())
+    times = Counter[str]()
+    for one in parts:
+        times.update(one.times_ms)
+    if isinstance(result, RigNotLocalized):
+        return NotLocalized(result.reason, times_ms=dict(times), detail=result.detail)
+    best = max((result.cameras[name] for name in result.used), key=lambda one: one.num_inliers)
+    node_id = best.node_id if isinstance(best, Localization) else best.alternatives[0].node_id
+    return Localization(
+        result.world_from_rig,
+        result.world_from_rig.transform_covariance(result.covariance),
+        result.probability,
+        node_id,
+        best.candidates,
+        best.num_matches,
+        best.num_inliers,
+        dict(times),
+        provenance=best.provenance,
+    )
 
 
 def _cameras_json(result: RigLocalization | RigNotLocalized) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from topoloc import (
     cut_panorama,
     open_sequence,
 )
-from topoloc.apps.core_names import as_monocular
+from topoloc.apps.core_names import RigFrame, as_monocular, select_frames, split_selection
 from topoloc.plugin import (
     IndexedFrames,
     RecordingFormat,
@@ -40,7 +40,8 @@ _POSE_FILES = ("truth.tum", "poses.tum", "poses.txt")
 
 @dataclass(frozen=True, eq=False)
 class RigWalk:
-    """Hold the recordings of a rig's cameras, and the name and time of each instant."""
+    """Hold the recordings of a rig's cameras, and the name and time of each instant. `poses` are
+    those of the rig by the file beside rig.json, None without one."""
 
     folder: Path
     rig: Rig
@@ -48,22 +49,28 @@ class RigWalk:
     rows: dict[str, dict[str, int]]
     names: list[str]
     t_ns: list[int]
+    poses: list[Rigid3 | None]
 
     @staticmethod
     def open(folder: Path, rig_file: Path) -> RigWalk:
-        """Open the recordings of the cameras that have one.
+        """Open the recordings of a rig that is in a file. Raises as `of_rig`; CalibrationError: the
+        file of the rig has another content."""
+        return RigWalk.of_rig(folder, Rig.read(rig_file), str(rig_file))
+
+    @staticmethod
+    def of_rig(folder: Path, rig: Rig, source: str) -> RigWalk:
+        """Open the recordings of the cameras that have one. `source` is where the rig is from.
 
         Cameras without a model in the file of the rig take that of their recording.
 
         Raises:
             RecordingError: no camera has a recording, one cannot be read, or names differ.
-            CalibrationError: the file of the rig has another content.
+            TrajectoryError: the poses are malformed.
         """
-        rig = Rig.read(rig_file)
         found = [name for name in rig.cameras if (folder / name).exists()]
         if not found:
             raise RecordingError(
-                f"{folder}: no folder is named as a camera of {rig_file} ({', '.join(rig.cameras)})"
+                f"{folder}: no folder is named as a camera of {source} ({', '.join(rig.cameras)})"
             )
         walks = {name: as_monocular(open_sequence(folder / name)) for name in found}
         cameras = {
@@ -81,7 +88,20 @@ class RigWalk:
         t_ns = [times[name] for name in names]
         if any(after <= before for before, after in pairwise(t_ns)):  # numbers of photos, no times
             t_ns = times_from_rate(len(names), 1)
-        return RigWalk(folder, Rig(cameras), walks, rows, names, t_ns)
+        files = [folder / name for name in _POSE_FILES]
+        poses = read_ground_truth(files[0], files[1:], t_ns, names)
+        return RigWalk(folder, Rig(cameras), walks, rows, names, t_ns, poses)
+
+    def find_pose(self, row: int) -> Rigid3 | None:
+        """Return world_from_rig of an instant by its file, or by the first camera with a pose."""
+        if self.poses[row] is not None:
+            return self.poses[row]
+        for camera, own in self.rows.items():
+            taken = own.get(self.names[row])
+            pose = None if taken is None else self.walks[camera].poses[taken]
+            if pose is not None:
+                return pose @ self.rig.cameras[camera].rig_from_cam.inverse()
+        return None
 
     def read_images(self, name: str) -> dict[str, Image]:
         """Return the images of an instant by the names of their cameras. Raises
@@ -136,13 +156,11 @@ class RigRecording(IndexedFrames):
 
 
 def open_rig(path: Path) -> RigRecording:
-    """Open a folder. Raises as `RigWalk.open`; TrajectoryError: the poses are malformed."""
+    """Open a folder. Raises as `RigWalk.open`."""
     walk = RigWalk.open(path, path / "rig.json")
-    files = [path / name for name in _POSE_FILES]
-    of_rig = read_ground_truth(files[0], files[1:], walk.t_ns, walk.names)
     places, names, times = list[tuple[str, int]](), list[str](), list[int]()
     poses = list[Rigid3 | None]()
-    for instant, t_ns, world_from_rig in zip(walk.names, walk.t_ns, of_rig, strict=True):
+    for instant, t_ns, world_from_rig in zip(walk.names, walk.t_ns, walk.poses, strict=True):
         for k, (camera, rows) in enumerate(walk.rows.items()):
             if instant not in rows:
                 continue
@@ -209,6 +227,63 @@ def open_panoramas(path: Path) -> PanoramaRecording:
         [t_ns + k for t_ns in panoramas.t_ns for k in range(len(turns))],
         [None if one is None else one @ by for one in panoramas.poses for by in turns],
     )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Instants(IndexedFrames):
+    """A StereoSequence whose frames are the instants of a rig, as `RigFrame`. `poses` are
+    world_from_rig, `read` returns the rig and the images of a row."""
+
+    name: str
+    names: list[str]
+    t_ns: list[int]
+    poses: list[Rigid3 | None]
+    read: Callable[[int], tuple[Rig, dict[str, Image]]]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def read_frame(self, row: int) -> RigFrame:
+        """Read one instant. Raises UnreadableImageError; QueryError: no panorama."""
+        rig, images = self.read(row)
+        name, image = next(iter(images.items()))
+        camera, pose = rig.cameras[name].camera, self.poses[row]
+        taken = self.names[row], self.t_ns[row], image, camera
+        return RigFrame(*taken, world_from_cam=pose, mounted=rig, images=images)
+
+
+def is_rig(path: str) -> bool:
+    """Return whether a path, perhaps with a selection, is a folder with rig.json."""
+    return (split_selection(path)[0] / "rig.json").is_file()
+
+
+def open_instants(path: str, rig_file: str | None = None) -> StereoSequence:
+    """Open a folder with one recording for each camera of a rig, or panoramas. PATH@0::2 selects
+    instants.
+
+    Args:
+        rig_file: a rig.json, None: that of the folder; or `equirectangular`.
+
+    Raises:
+        RecordingError, CalibrationError, TrajectoryError: as `RigWalk.open`.
+    """
+    if rig_file == "equirectangular":
+        of = as_monocular(open_sequence(path))
+        return Instants(
+            of.name, of.names, of.t_ns, of.poses, lambda row: cut_panorama(of[row].image)
+        )
+    folder, selection = split_selection(path)
+    walk = RigWalk.open(folder, folder / "rig.json" if rig_file is None else Path(rig_file))
+    rows = range(len(walk.names))
+    poses = [walk.find_pose(row) for row in rows]
+    instants = Instants(
+        folder.name,
+        walk.names,
+        walk.t_ns,
+        poses,
+        lambda row: (walk.rig, walk.read_images(walk.names[row])),
+    )
+    return select_frames(instants, selection)
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, lambda path: os.path.isfile(path / "rig.json"), open_rig)

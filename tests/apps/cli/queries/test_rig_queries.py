@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -117,3 +118,39 @@ def test_images_of_one_instant_have_one_name(
     rig = _write_rig(tmp_path)
     assert main(["localize", str(place / "lab.topo"), str(walk), "--rig", str(rig)]) == 1
     assert "name the images of one instant alike" in capsys.readouterr().err
+
+
+def _write_truth(walk: Path) -> None:
+    lines = list[str]()
+    for row, first in enumerate(INSTANTS):
+        _, _, pose = instant(first)
+        w, x, y, z = pose.quat_wxyz()
+        lines.append(" ".join(map(str, [row / 10, *pose.translation, x, y, z, w])))
+    (walk / "truth.tum").write_text("\n".join(lines) + "\n")
+
+
+def test_the_poses_of_a_rig_are_evaluated(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    walk = tmp_path / "walk"
+    shutil.copytree(place / "walk", walk)
+    _write_rig(walk)
+    _write_truth(walk)
+    results = tmp_path / "out.json"
+    arguments = ["evaluate", str(place / "lab.topo"), str(walk), "--json", str(results)]
+    assert main(arguments) == 0
+    table = capsys.readouterr().out
+    found = json.loads(results.read_text())
+    assert found["num_queries"] == len(INSTANTS)
+    right, other = found["answers"]
+    assert right["localized"] is True
+    assert sorted(right["used"]) == list(NAMES)
+    truth = right["true_world_from_rig"]["translation"]
+    assert np.allclose(right["world_from_rig"]["translation"], truth, atol=0.03)
+    assert "false accepts" in table
+    # the mountings are those of the first instant, and wrong at the second
+    assert found["left_out"] if other["localized"] else found["not_localized"]["ambiguous"] == 1
+    assert main([*arguments[:2], f"{walk}@0"]) == 0
+    assert "1 of 1 (100.0 %)" in capsys.readouterr().out
+    assert main([*arguments[:3], "--camera", "map"]) == 2
+    assert "the calibrations of rigs are in rig.json" in capsys.readouterr().err

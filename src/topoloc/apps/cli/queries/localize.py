@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -69,6 +68,7 @@ from topoloc.apps.cli.queries.rig_queries import localize_rigs, write_rig_answer
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.core_names import as_monocular, find_format, split_selection
 from topoloc.apps.formats.live import LiveSource, is_live
+from topoloc.apps.formats.rig import is_rig
 from topoloc.apps.query_camera import CameraOfSize
 
 
@@ -249,9 +249,7 @@ class Command:
     @property
     def _is_rig(self) -> bool:
         """Return whether the inputs are images of rigs."""
-        return self.rig is not None or any(
-            os.path.isfile(f"{path}/rig.json") for path in self.inputs
-        )
+        return self.rig is not None or any(map(is_rig, self.inputs))
 
     @property
     def _stereo_calibration(self) -> str | None:

@@ -32,11 +32,12 @@ from topoloc import (
     localize_queries,
     with_pose_conventions,
 )
-from topoloc.apps.cli.output import open_recording, print_warning
+from topoloc.apps.cli.output import UsageError, open_recording, print_warning
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
 from topoloc.apps.core_names import find_available_types
+from topoloc.apps.formats.rig import is_rig, open_instants
 
 MAX_IMAGES = 50
 """Images of a piece. It takes about a second to open map and recording, much less than these."""
@@ -66,7 +67,14 @@ class QueryRecording:
         """Open the recording. Notes about it go to standard error. Raises the errors of
         `open_sequence`; UsageError: the pose convention is unknown."""
         reading = PoseConventions.parse(self.poses)
-        sequence = open_recording(self.path, self.format, self.camera, self.topics, whole_only=True)
+        how = self.format, self.camera, self.topics
+        if self.format == "equirectangular" or (self.format in (None, "rig") and is_rig(self.path)):
+            if self.camera or self.topics:
+                raise UsageError("the calibrations of rigs are in rig.json: no --camera, --topics")
+            panoramas = self.format if self.format == "equirectangular" else None
+            sequence = open_instants(self.path, panoramas)
+        else:
+            sequence = open_recording(self.path, *how, whole_only=True)
         return sequence if self.is_out_of_map else with_pose_conventions(sequence, reading)
 
     def frames(self, sequence: StereoSequence) -> list[int]:

@@ -4,58 +4,25 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
 from topoloc import (
-    Image,
     Localizer,
     QueryError,
-    Rig,
     RigLocalization,
     RigLocalizer,
     RigNotLocalized,
+    StereoSequence,
     Trajectory,
     UnreadableImageError,
-    cut_panorama,
-    open_sequence,
 )
 from topoloc.apps.cli.output import UsageError, print_line, progress_bar, write_text
-from topoloc.apps.core_names import as_monocular, format_length
-from topoloc.apps.formats.rig import RigWalk
-
-
-@dataclass(frozen=True, eq=False)
-class Instant:
-    """The images of one instant. `read` returns the rig and its images, or raises
-    UnreadableImageError."""
-
-    name: str
-    t_ns: int
-    read: Callable[[], tuple[Rig, dict[str, Image]]]
-
-
-def open_instants(path: str, rig_file: str | None) -> list[Instant]:
-    """Open a folder with one recording for each camera of a rig, or panoramas. Raises as
-    `RigWalk.open`.
-
-    Args:
-        rig_file: a rig.json, None: that of the folder; or `equirectangular`.
-    """
-    if rig_file == "equirectangular":
-        panoramas = as_monocular(open_sequence(path))
-        return [
-            Instant(name, t_ns, lambda row=row: cut_panorama(panoramas[row].image))
-            for row, (name, t_ns) in enumerate(zip(panoramas.names, panoramas.t_ns, strict=True))
-        ]
-    walk = RigWalk.open(Path(path), Path(path, "rig.json") if rig_file is None else Path(rig_file))
-    return [
-        Instant(name, t_ns, lambda name=name: (walk.rig, walk.read_images(name)))
-        for name, t_ns in zip(walk.names, walk.t_ns, strict=True)
-    ]
+from topoloc.apps.core_names import RigFrame, format_length
+from topoloc.apps.formats.rig import open_instants
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,15 +64,18 @@ def localize_rigs(
         UsageError: there is no input.
         QueryError: an image has another size than its camera.
     """
+    if len(localizer.tile_ids) == 1:
+        localizer.topomap.require_scale("a rig")
     if not paths:
         raise UsageError("--rig takes folders with one recording for each camera, or panoramas")
-    instants = [instant for path in paths for instant in open_instants(path, rig_file)]
+    walks = [open_instants(path, rig_file) for path in paths]
+    total = sum(map(len, walks))
     answers = list[RigAnswer]()
     with progress_bar() as progress:
-        for answer in _answers(localizer, instants):
+        for answer in (one for walk in walks for one in _answers(localizer, walk)):
             answers.append(answer)
             print_line(json.dumps(answer.to_json()) if json_file == "-" else str(answer))
-            progress("queries", len(answers), len(instants))
+            progress("queries", len(answers), total)
     return answers
 
 
@@ -122,15 +92,15 @@ def write_rig_answers(answers: Sequence[RigAnswer], json_file: str | None, tum: 
         poses.write_tum(Path(tum), are_answers=True)
 
 
-def _answers(localizer: Localizer, instants: Sequence[Instant]) -> Iterator[RigAnswer]:
-    for instant in instants:
+def _answers(localizer: Localizer, instants: StereoSequence) -> Iterator[RigAnswer]:
+    for row, (name, t_ns) in enumerate(zip(instants.names, instants.t_ns, strict=True)):
         start = time.perf_counter()
         try:
-            rig, images = instant.read()
-            result = RigLocalizer(localizer, rig).localize(images)
+            frame = instants[row]
+            assert isinstance(frame, RigFrame)
+            result = RigLocalizer(localizer, frame.mounted).localize(frame.images)
         except UnreadableImageError as error:
             result = RigNotLocalized("unreadable", str(error), {})
         except QueryError as error:
-            raise QueryError(f"{instant.name}: {error}") from error
-        ms = 1e3 * (time.perf_counter() - start)
-        yield RigAnswer(instant.name, instant.t_ns, result, ms)
+            raise QueryError(f"{name}: {error}") from error
+        yield RigAnswer(name, t_ns, result, 1e3 * (time.perf_counter() - start))
