@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from topoloc.recordings.image_io import exif_focal_length, image_size, read_depth, read_image
+from topoloc.recordings.exif import exif_focal_length
+from topoloc.recordings.image_io import image_size, read_depth, read_image
 from topoloc.recordings.open import open_sequence
 
 from .damage import damage_file

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.recordings.image_io import exif_focal_length, read_image
+from topoloc.recordings.exif import exif_focal_length
+from topoloc.recordings.image_io import read_image
 
 SHORT, LONG, RATIONAL = 3, 4, 5
 FOCAL, FOCAL_35MM, WIDTH, RESOLUTION, UNIT = 0x920A, 0xA405, 0xA002, 0xA20E, 0xA210

@@ -15,9 +15,13 @@ from topoloc.features.network_files import (
     NetworkInfo as NetworkInfo,
     find_telemetry as find_telemetry,
 )
-from topoloc.geometry.alignment import nearest_rotation as nearest_rotation
+from topoloc.geometry.alignment import (
+    align_similarity as align_similarity,
+    nearest_rotation as nearest_rotation,
+)
 from topoloc.geometry.transform_consensus import find_least_median as find_least_median
 from topoloc.json_data import OneLine as OneLine, Positive as Positive
+from topoloc.lifelong.merge import rescale_map as rescale_map
 from topoloc.lifelong.node_localization import (
     LeaveOneOutResult as LeaveOneOutResult,
     find_near_nodes as find_near_nodes,
@@ -41,9 +45,13 @@ from topoloc.mapping.nodes import NodePoses as NodePoses, node_distances as node
 from topoloc.mapping.storage.entries import today as today
 from topoloc.node_ids import NodeId as NodeId, Row as Row
 from topoloc.recordings.atomic import (
+    close as close,
     collect_written_paths as collect_written_paths,
+    open_to_lock as open_to_lock,
     remove_stale_files as remove_stale_files,
     temporary_folder as temporary_folder,
+    try_lock as try_lock,
+    wait_for_lock as wait_for_lock,
 )
 from topoloc.recordings.calibration import (
     CalibrationForSize as CalibrationForSize,
@@ -63,6 +71,10 @@ from topoloc.recordings.camera_files import (
     yaml_numbers as yaml_numbers,
     yaml_word as yaml_word,
 )
+from topoloc.recordings.exif import (
+    exif_focal_length as exif_focal_length,
+    exif_place as exif_place,
+)
 from topoloc.recordings.format import complete_lists as complete_lists, read_times as read_times
 from topoloc.recordings.frame import SequenceView as SequenceView, to_grey as to_grey
 from topoloc.recordings.frame_preparation import prepare_frame as prepare_frame
@@ -70,11 +82,14 @@ from topoloc.recordings.image_files import find_path as find_path
 from topoloc.recordings.image_io import (
     IMAGE_SUFFIXES as IMAGE_SUFFIXES,
     MAX_PIXELS as MAX_PIXELS,
-    exif_focal_length as exif_focal_length,
     find_white_level as find_white_level,
 )
 from topoloc.recordings.named_poses import read_pose_matrix as read_pose_matrix
-from topoloc.recordings.open import find_format as find_format, split_selection as split_selection
+from topoloc.recordings.open import (
+    find_format as find_format,
+    select_frames as select_frames,
+    split_selection as split_selection,
+)
 from topoloc.recordings.recording import (
     RightImages as RightImages,
     as_monocular as as_monocular,
@@ -94,6 +109,8 @@ from topoloc.recordings.trajectory import (
     has_answers as has_answers,
     timed_trajectory as timed_trajectory,
 )
+from topoloc.rigs.mountings import Mounting as Mounting, find_mountings as find_mountings
+from topoloc.rigs.rig import RigFrame as RigFrame
 from topoloc.slam.view_graph import match_views as match_views
 
 __all__: list[str]

@@ -226,6 +226,7 @@ def store_tile(new: NewTile, put: PutFile) -> Tile:
     with TopoMetricMap.load(new.path) as topomap, scratch as path:
         if len(topomap.summaries) == 0:
             raise EmptyMapError(f"map {new.path} has no nodes")
+        topomap.require_scale("an atlas")
         vectors = compute_global_descriptors(topomap)
         versions = {kind: one.version for kind in vectors if (one := shared_vocabulary(kind))}
         save_global_descriptors(path, vectors)

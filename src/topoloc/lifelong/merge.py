@@ -6,7 +6,8 @@ first map. The second map's nodes are then aligned like the frames of a session
 (`session_poses.py`). Nodes that the first map localizes well are skipped. The other nodes are added
 with their sessions, landmark statistics and virtual nodes.
 
-`move_map` moves a map to another world: all its poses change, and no distance.
+`move_map` moves a map to another world: all its poses change, and no distance. `rescale_map`
+changes all lengths.
 """
 
 from __future__ import annotations
@@ -16,13 +17,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.node_localization import localize_nodes, measure_recall_change
 from topoloc.lifelong.session_content import is_well_localized, update_coarse_models
 from topoloc.lifelong.session_poses import align_motion_to_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.map_building import with_map_statistics
+from topoloc.localization.map_facts.map_building import (
+    carry_over_error_shares,
+    with_map_statistics,
+    with_repetitions,
+)
 from topoloc.mapping.config import Progress
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.node_drafts import add_virtual_nodes
@@ -81,6 +88,8 @@ def merge_maps(
     """Merge the second map into the first. Return the result in the first map's world, and the
     numbers of changes by name. Raises as `merge`."""
     progress = progress or (lambda stage, done, total: None)
+    for one in (first, second):
+        one.require_scale("a merge")
     if missing := set(first.kinds) - set(second.kinds):
         raise MapError(
             f"the second map holds no features {', '.join(sorted(missing))}, which the first has;"
@@ -253,15 +262,54 @@ def move_map(
         edit.commit(moved, name, {"new_from_old": text})
 
 
-def move_world(topomap: TopoMetricMap, new_from_old: Rigid3) -> TopoMetricMap:
-    """Return the map with all its poses in another world. Its statistics are no longer those of
-    its nodes."""
+def rescale_map(
+    path: str | Path, factor: float, scale_sigma: float, on_wait: WaitCallback | None = None
+) -> None:
+    """Multiply all lengths of a map file by a factor, after which they are metres, as one edit. A
+    place on earth, which was fitted to other lengths, is dropped.
+
+    Args:
+        scale_sigma: relative standard deviation of the new lengths.
+
+    Raises:
+        MapError: the factor is out of bounds; the map is missing, damaged, or cannot be written.
+    """
+    if not 1e-4 < factor < 1e4:
+        raise MapError(
+            f"map {path}: lengths times {factor:.3g} are no metres; check what is stated"
+        )
+    with edit_map(path, on_wait) as edit:
+        topomap = edit.topomap
+        moved = move_world(topomap, Rigid3.identity(), factor)
+        nodes = topomap.config.nodes
+        d_thresh, lambda_rot = factor * topomap.config.d_thresh, factor * topomap.config.lambda_rot
+        nodes = replace(nodes, d_thresh=d_thresh, lambda_rot=lambda_rot)
+        config = replace(topomap.config, nodes=nodes, scale_sigma=scale_sigma)
+        length_m = factor * topomap.length_m
+        moved = replace(moved, config=config, length_m=length_m, georeference=None)
+        moved = with_repetitions(carry_over_error_shares(moved, topomap))
+        edit.commit(moved, "scale", {"factor": f"{factor:.7g}", "sigma": f"{scale_sigma:.2g}"})
+
+
+def move_world(topomap: TopoMetricMap, new_from_old: Rigid3, factor: float = 1.0) -> TopoMetricMap:
+    """Return the map with all lengths times a factor, and all its poses in another world. Its
+    statistics are no longer those of its nodes."""
 
     def move(of: T) -> T:
-        return replace(of, world_from_cam=new_from_old @ of.world_from_cam)
+        pose = of.world_from_cam
+        scaled = Rigid3(pose.rotation, factor * pose.translation)
+        return replace(of, world_from_cam=new_from_old @ scaled)
 
     def move_node(node: TopoNode) -> TopoNode:
-        return replace(node, summary=move(node.summary))
+        if factor == 1.0:
+            return replace(node, summary=move(node.summary))
+        return replace(
+            node,
+            summary=move(node.summary),
+            points_cam=node.points_cam * np.float32(factor),
+            point_sqrt_covs=np.clip(node.point_sqrt_covs * np.float32(factor), -6e4, 6e4),
+            session_statistics=[one.scaled(factor) for one in node.session_statistics],
+        )
 
     known, sides = topomap.georeference, topomap.sides
     if known is not None:
@@ -270,7 +318,7 @@ def move_world(topomap: TopoMetricMap, new_from_old: Rigid3) -> TopoMetricMap:
     if sides is not None:  # with the places of their retrieval model
         models = dict(sides.coarse_models)
         for name, model in models.items():
-            centres = new_from_old.apply(model.arrays["centres"])
+            centres = new_from_old.apply(factor * model.arrays["centres"])
             models[name] = replace(model, arrays={**model.arrays, "centres": centres})
         summaries, nodes = [*map(move, sides.summaries)], change_each(sides.nodes, move_node)
         sides = replace(sides, summaries=summaries, nodes=nodes, coarse_models=models)

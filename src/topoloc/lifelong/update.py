@@ -222,6 +222,7 @@ def update(
         sequence = open_sequence(sequence)
     poses_from = poses_from or default_pose_source(sequence)
     with edit_map(path, on_wait) as edit:
+        edit.topomap.require_scale("an update")
         check_session_is_new(edit.topomap, sequence)  # before its poses are estimated
         if find_poses is not None:
             posed = find_poses(poses_from)

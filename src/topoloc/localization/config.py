@@ -25,6 +25,9 @@ class EvidenceConfig:
     tolerance: Annotated[tuple[float, float] | None, Between(1e-3, 1000)] = None
     """Maximum errors of a right pose, metres and degrees, if other than those of the weights. A
     pose with larger standard deviations is refused as `imprecise`."""
+    is_relative: bool = False
+    """The position error of a right pose is at most 5 % of the distance of the seen points, however
+    far these are. Always so in a map without scale."""
     min_inliers: Annotated[int, AtLeast(4)] = 5
     """Minimum number of inliers of a pose proposal. Proposals with fewer are not tested."""
     min_found: Annotated[int, AtLeast(4)] = 12

@@ -251,7 +251,7 @@ def widen_by_scale(query: MapQuery, answer: Answer) -> Finding | None:
     """Add the uncertainty of the map's scale to the covariance: the whole map grows or shrinks
     about the world's origin."""
     pose, sigma = answer.pose, query.opened.topomap.config.scale_sigma
-    if pose is None or sigma == 0.0:
+    if pose is None or not sigma:  # without scale, units are exact
         return None
     covariance, shift = pose.covariance.copy(), sigma * pose.world_from_cam.translation
     covariance[:3, :3] += np.outer(shift, shift)

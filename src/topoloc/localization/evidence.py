@@ -41,7 +41,8 @@ def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -
     away."""
     # Maximum position error as a share of the median distance of the seen points.
     depth_share, max_translation = 0.05, config.max_errors[0]
-    return max_translation * min(1.0, depth_share * median_depth / config.max_translation)
+    share = depth_share * median_depth / config.max_translation
+    return max_translation * (share if config.is_relative else min(1.0, share))
 
 
 def compute_normalized_uncertainty(
@@ -60,7 +61,7 @@ def compute_normalized_uncertainty(
             metres / compute_translation_tolerance(median_depth, one),
             math.degrees(radians) / one.max_errors[1],
         )
-        for one in (EvidenceConfig(), config)
+        for one in (replace(config, tolerance=None), config)
     )
     return max(asked, min(fitted, _PRECISE_DOUBT))
 

@@ -86,7 +86,12 @@ class MapContext:
         weights: FittedWeights | None = None,
         features: str | None = None,
     ) -> MapContext:
-        """Open a map for queries. The arguments and errors are those of `Localizer`."""
+        """Open a map for queries. The arguments and errors are those of `Localizer`. Raises
+        MapError: a tolerance in metres is given, and the map has no scale."""
+        if not topomap.config.has_scale:
+            if config.evidence.tolerance is not None:
+                topomap.require_scale("--tolerance")
+            config = replace(config, evidence=replace(config.evidence, is_relative=True))
         requested = config.kinds
         if features is not None:
             requested = select_stored_types(topomap.kinds, features)
@@ -160,7 +165,12 @@ class MapContext:
             found = result.provenance.camera  # estimated with the pose
             camera = None if found is None else found.rescaled(camera.width, camera.height)
         provenance = Provenance(
-            self.map_id, self.topomap.version, result.provenance.features, t_ns=t_ns, camera=camera
+            self.map_id,
+            self.topomap.version,
+            result.provenance.features,
+            t_ns=t_ns,
+            camera=camera,
+            has_scale=self.topomap.config.has_scale,
         )
         georeference = self.topomap.georeference
         if isinstance(result, NotLocalized):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from msgspec import Struct
 from msgspec.structs import asdict
@@ -84,6 +84,7 @@ class Provenance(OneLine):
         atlas_from_cam: camera pose in the atlas's world, None if unknown.
         joint_world: name of the world that the tile shares with joined tiles.
         joint_from_cam: camera pose in the joint world.
+        has_scale: whether lengths are metres. False: units of the map, whose scale is unknown.
         query: name of the image, if the result was read. It is not compared.
     """
 
@@ -96,6 +97,7 @@ class Provenance(OneLine):
     atlas_from_cam: Rigid3 | None = None
     joint_world: str | None = None
     joint_from_cam: Rigid3 | None = None
+    has_scale: bool = True
     query: str = field(default="", compare=False)
 
     def to_json(self) -> dict[str, Any]:
@@ -108,6 +110,7 @@ class Provenance(OneLine):
             of_atlas["joint_world"] = self.joint_world
         if self.joint_from_cam is not None:
             of_atlas["joint_from_cam"] = self.joint_from_cam.to_json()
+        of_atlas |= {} if self.has_scale else {"scale": "none"}
         return of_atlas | {
             "map": self.map_id,
             "version": self.map_version,
@@ -124,6 +127,7 @@ class Provenance(OneLine):
             ResultError: a value is invalid.
         """
         read = asdict(decode_json(data, _ProvenanceJson, ResultError, "no result"))
+        read["has_scale"] = read.pop("scale") is None
         if read["camera"] is not None:
             with ResultError.at("no result", CalibrationError):
                 read["camera"] = Camera.from_json(read["camera"])
@@ -141,6 +145,7 @@ class _ProvenanceJson(Struct, frozen=True, rename={"map_id": "map", "map_version
     joint_world: str | None = None
     joint_from_cam: Rigid3 | None = None
     query: str = ""
+    scale: Literal["none"] | None = None
 
 
 EMPTY_PROVENANCE = Provenance()

@@ -117,7 +117,7 @@ class Localization(_Result):
     appearance: float | None = None
 
     def __repr__(self) -> str:
-        sigmas = f"{100 * self.position_sigma_m:.1f} cm, {self.rotation_sigma_deg:.2f} deg"
+        sigmas = f"{self.position_sigma_text}, {self.rotation_sigma_deg:.2f} deg"
         p = f"{self.probability:.3f}, node {self.node_id}"
         return f"Localization({self.world_from_cam}, sigma {sigmas}, p {p})"
 
@@ -136,8 +136,15 @@ class Localization(_Result):
 
     @property
     def position_sigma_m(self) -> float:
-        """Return the root mean square position error (metres) by `camera_covariance`."""
+        """Return the root mean square position error by `camera_covariance`, metres, or units
+        of a map without scale."""
         return float(np.sqrt(np.trace(self.camera_covariance[:3, :3])))
+
+    @property
+    def position_sigma_text(self) -> str:
+        """Return `position_sigma_m` with its unit, cm, or units of a map without scale."""
+        sigma = self.position_sigma_m
+        return f"{100 * sigma:.1f} cm" if self.provenance.has_scale else f"{sigma:.2g} units"
 
     @property
     def rotation_sigma_deg(self) -> float:
@@ -165,12 +172,13 @@ class Localization(_Result):
             "calibration_doubt": self.calibration_doubt and self.calibration_doubt.to_json(),
             "geopose": self.geopose and self.geopose.to_json(),
         }
+        has_scale = self.provenance.has_scale
         return {
             "query": self.provenance.query if query is None else query,
             "localized": True,
             "world_from_cam": self.world_from_cam.to_json(),
             "covariance": self.covariance.tolist(),
-            "position_sigma_m": self.position_sigma_m,
+            "position_sigma_m" if has_scale else "position_sigma": self.position_sigma_m,
             "rotation_sigma_deg": self.rotation_sigma_deg,
             "probability": self.probability,
             **({} if self.calibrated else {"calibrated": False}),

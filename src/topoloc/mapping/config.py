@@ -56,9 +56,9 @@ class MapConfig(OneLine):
     look_alike_floors: bool = False
     """The building has other floors like this one that the map does not hold. A pose is then given
     only if the colours agree."""
-    scale_sigma: Annotated[float, Between(0, 1)] = 0.0
+    scale_sigma: Annotated[float | None, Between(0, 1)] = 0.0
     """Relative standard deviation of all lengths of the map, such as those of photos whose scale is
-    that of a printed tag."""
+    that of a printed tag. None: the scale is unknown, and lengths are in units of the map."""
 
     @property
     def kinds(self) -> list[str]:
@@ -101,6 +101,11 @@ class MapConfig(OneLine):
         return replace(self.vlad, position_weight=find_feature_type(kind).position_weight)
 
     @property
+    def has_scale(self) -> bool:
+        """Return whether lengths are metres."""
+        return self.scale_sigma is not None
+
+    @property
     def d_thresh(self) -> float:
         """Return D_thresh of Eq. 1 in metres. It must be resolved, as in any built map."""
         return _resolved(self.nodes.d_thresh)
@@ -113,7 +118,7 @@ class MapConfig(OneLine):
     def to_json(self) -> dict[str, Any]:
         """Return the settings and their version as JSON."""
         settings = asdict(self)
-        if not self.scale_sigma:  # earlier versions do not know it
+        if self.scale_sigma == 0.0:  # earlier versions do not know it
             del settings["scale_sigma"]
         return {"version": CONFIG_VERSION, **settings}
 

@@ -121,6 +121,14 @@ class LandmarkStatistics:
         except np.linalg.LinAlgError as error:
             raise CorruptDataError(f"sums of session {self.session_id}: no covariances") from error
 
+    def scaled(self, factor: float) -> LandmarkStatistics:
+        """Return the statistics in a world whose lengths are this many times as long. Pulls have no
+        unit."""
+        roots = self.roots.astype(np.float64)
+        is_empty = (np.abs(roots) <= _MAX_EMPTY_ROOT).all(axis=1, keepdims=True)
+        roots = np.where(is_empty, roots, np.clip(roots / factor, -6e4, 6e4))
+        return replace(self, roots=roots.astype(np.float16))
+
     def with_counts(self, counted: LandmarkStatistics) -> LandmarkStatistics:
         """Return the statistics with the counts of further images, of the same session or not."""
         rows = np.union1d(self.rows, counted.rows)

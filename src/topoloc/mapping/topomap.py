@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, SupportsInt, no_type_check
 
 import numpy as np
 
-from topoloc.errors import EmptyMapError, FeatureTypeError
+from topoloc.errors import EmptyMapError, FeatureTypeError, MapError
 from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -57,7 +57,7 @@ class TopoMetricMap:
     - `summaries[i]` describes the node of row i. Their ids increase.
     - `layers` holds the points of the nodes by feature type.
     - `config` is the resolved configuration of the build.
-    - `length_m` is the mapped trajectory length in metres.
+    - `length_m` is the mapped trajectory length in metres (or units, without scale).
     - `default_coarse` names the default coarse localizer.
     - `repetitions` is None if not measured.
     - `sides` holds the virtual nodes. None if no mapping image is wide enough to show the walls
@@ -148,8 +148,9 @@ class TopoMetricMap:
         return self.sides if self.sides is not None and self.sides.kind in kinds else None
 
     def describe(self, path: str | Path) -> dict[str, Any]:
-        """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,
-        junctions, sessions, edits, configuration. Raises EmptyMapError: the map has no node."""
+        """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres
+        (or lengths in units of a map without scale), junctions, sessions, edits, configuration.
+        Raises EmptyMapError: the map has no node."""
         from topoloc.mapping.storage.map_reading import list_coarse_models
 
         path = Path(path)
@@ -158,6 +159,7 @@ class TopoMetricMap:
         models = list_coarse_models(path)
         centres = np.array([s.world_from_cam.translation for s in self.summaries])
         num_nodes = Counter(summary.session_id for summary in self.summaries)
+        unit = "_m" if self.config.has_scale else ""
         return {
             "path": str(path),
             "map": self.id,
@@ -169,9 +171,10 @@ class TopoMetricMap:
             "num_points": sum(s.num_points for s in self.summaries),
             "num_side_nodes": len(self.sides.summaries) if self.sides else 0,
             "num_place_images": len(self.place_images),
-            "length_m": round(self.length_m, 3),
+            **({} if unit else {"scale": "none"}),
+            f"length{unit}": round(self.length_m, 3),
             "junctions": self.junctions,
-            "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
+            f"extent{unit}": np.ptp(centres, axis=0).round(3).tolist(),
             "recordings": sorted({s.recording for s in self.summaries}),
             "sessions": [
                 asdict(session)
@@ -197,6 +200,15 @@ class TopoMetricMap:
         from topoloc.mapping.junctions import describe_junctions
 
         return describe_junctions(self)
+
+    def require_scale(self, use: str) -> None:
+        """Raise MapError if lengths of the map are not metres, which `use` needs."""
+        if not self.config.has_scale:
+            name = self.id if self.file is None else self.file.path
+            raise MapError(
+                f"map {name} has no scale, but {use} needs metres: set it by `topoloc scale {name}"
+                " --distance IMAGE_A,IMAGE_B=3.2m`, or --tag METRES"
+            )
 
     def describe_certificate(self) -> dict[str, Any] | None:
         """Return the certificate as JSON, with its promise and whether the map was edited since."""

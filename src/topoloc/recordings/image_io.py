@@ -9,7 +9,6 @@ size is the size after rotation.
 from __future__ import annotations
 
 import io
-import math
 import stat
 import struct
 import warnings
@@ -19,7 +18,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -51,11 +49,9 @@ _IMAGE_TYPES = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP")
 # Pillow warns of odd metadata and of large images. `MAX_PIXELS` is the limit here.
 warnings.filterwarnings("ignore", module=r"PIL\.")
 _GREY_MODES, _GREY_16_MODES = ("L", "1"), ("I;16", "I;16L", "I;16B", "I")
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}  # inch, centimetre, millimetre
-_DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 # errors that Pillow raises for damaged files
-_DAMAGE_ERRORS = (
+DAMAGE_ERRORS = (
     *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError),
     *(EOFError, struct.error, zlib.error),
 )
@@ -89,7 +85,7 @@ def read_image(
         UnreadableImageError: the file is missing, empty, truncated, damaged, not an image, or
             larger than 100 megapixels.
     """
-    with _open_image(path) as picture:
+    with open_image(path) as picture:
         if picture.format == "WEBP" and (as_stored or _orientation(picture) == 1):
             return _decode_webp(path, _reduction(picture, max_pixels))
     with _decode_image(path, as_stored, max_pixels) as picture:
@@ -120,7 +116,7 @@ def find_white_level(paths: Iterable[Path | EncodedImage]) -> int:
     """
     white = 0
     for path in paths:
-        with suppress(UnreadableImageError), _open_image(path) as picture:
+        with suppress(UnreadableImageError), open_image(path) as picture:
             if picture.mode not in _GREY_16_MODES:
                 break
             white = max(white, _white_level(np.array(picture).astype(np.uint16)))
@@ -167,45 +163,10 @@ def image_size(path: Path | EncodedImage, as_stored: bool = False) -> tuple[int,
     Raises:
         UnreadableImageError: as `read_image`, as far as the header shows it.
     """
-    with _open_image(path) as picture:
+    with open_image(path) as picture:
         width, height = picture.size
         is_turned = _orientation(picture) in _TRANSPOSED_ORIENTATIONS
         return (height, width) if is_turned and not as_stored else (width, height)
-
-
-def exif_focal_length(path: Path | EncodedImage, width: int, height: int) -> float | None:
-    """Return the focal length in pixels from EXIF data, for an image of this size. Return None if
-    the data is not usable.
-
-    The focal length equivalent on 35 mm film is used first, relative to the image's diagonal. The
-    second choice is the focal length in millimetres with the sensor's resolution (EXIF 2.32, JEITA
-    CP-3451).
-    """
-    try:
-        with _open_image(path) as picture:
-            found = picture.getexif().get_ifd(ExifTags.IFD.Exif)
-            tags = {tag: _exif_number(found.get(tag)) for tag in ExifTags.Base}
-    except (UnreadableImageError, *_DAMAGE_ERRORS):
-        return None
-    focal = tags[ExifTags.Base.FocalLengthIn35mmFilm] * math.hypot(width, height) / _DIAGONAL_35MM
-    if not focal > 0.0:
-        mm_a_unit = _MM_PER_UNIT.get(int(tags[ExifTags.Base.FocalPlaneResolutionUnit]), 25.4)
-        exif_width = tags[ExifTags.Base.ExifImageWidth]
-        # The original width, before rotation.
-        scale = max(width, height) / exif_width if exif_width > 0.0 else 1.0
-        pixels_per_unit = tags[ExifTags.Base.FocalPlaneXResolution]
-        focal = tags[ExifTags.Base.FocalLength] * pixels_per_unit / mm_a_unit * scale
-    side = max(width, height)
-    return focal if 0.1 * side < focal < 50.0 * side else None
-
-
-def _exif_number(value: Any) -> float:
-    """Return an EXIF tag as a number, or 0 if it is not a finite number."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return 0.0
-    return number if math.isfinite(number) else 0.0
 
 
 def _read_bytes(path: str | Path | EncodedImage) -> bytes:
@@ -229,7 +190,7 @@ def _read_bytes(path: str | Path | EncodedImage) -> bytes:
 
 
 @contextmanager
-def _open_image(path: str | Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
+def open_image(path: str | Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
     """Yield the image with its header read. Errors of damaged files raised in the body become
     UnreadableImageError."""
     data = _read_bytes(path)
@@ -245,7 +206,7 @@ def _open_image(path: str | Path | EncodedImage) -> Iterator[ImageFile.ImageFile
         raise UnreadableImageError(
             f"{path}: more than {MAX_PIXELS // 1_000_000} megapixels"
         ) from None
-    except _DAMAGE_ERRORS as error:
+    except DAMAGE_ERRORS as error:
         raise UnreadableImageError(
             f"{path}: not a picture, or damaged ({_one_line(error)})"
         ) from None
@@ -257,7 +218,7 @@ def _open_image(path: str | Path | EncodedImage) -> Iterator[ImageFile.ImageFile
             raise UnreadableImageError(f"{path}: {width}x{height} is more than {most}")
         try:
             yield picture
-        except _DAMAGE_ERRORS as error:
+        except DAMAGE_ERRORS as error:
             raise UnreadableImageError(f"{path}: damaged picture ({_one_line(error)})") from None
 
 
@@ -265,7 +226,7 @@ def _open_image(path: str | Path | EncodedImage) -> Iterator[ImageFile.ImageFile
 def _decode_image(
     path: str | Path | EncodedImage, as_stored: bool = False, max_pixels: int = MAX_PIXELS
 ) -> Iterator[Pillow.Image]:
-    with _open_image(path) as picture:
+    with open_image(path) as picture:
         factor = _reduction(picture, max_pixels)
         if factor > 1 and picture.format == "JPEG":  # reduced while it is decoded
             picture.draft(None, (picture.width // factor or 1, picture.height // factor or 1))

@@ -16,6 +16,7 @@ from topoloc.errors import RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.exif import exif_focal_length
 from topoloc.recordings.frame import (
     DepthImage,
     Image,
@@ -28,7 +29,6 @@ from topoloc.recordings.frame import (
 from topoloc.recordings.image_files import find_path
 from topoloc.recordings.image_io import (
     depth_image_of,
-    exif_focal_length,
     find_white_level,
     read_depth_image,
     read_image,

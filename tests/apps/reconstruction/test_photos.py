@@ -4,6 +4,7 @@ line, from images to a map in metres."""
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 
 import cv2
@@ -38,7 +39,8 @@ def test_photos_of_a_tag_become_a_metric_map(
     target = tmp_path / "room.topo"
     assert _build(photos, target) == 1  # no scale: refused with the remedies
     refused = capsys.readouterr().err
-    assert all(one in refused for one in ("no scale", "--scale IMAGE_A,IMAGE_B=", "--tag METRES"))
+    remedies = ("no scale", "--scale IMAGE_A,IMAGE_B=", "--tag METRES", "--scale none")
+    assert all(one in refused for one in remedies)
     assert not target.exists()
 
     # what was computed is kept: no image is matched again
@@ -67,6 +69,7 @@ def test_photos_of_a_tag_become_a_metric_map(
     assert np.median(errors) < 0.01
 
     sigma = topomap.config.scale_sigma
+    assert sigma is not None
     assert 0.003 < sigma < 0.03
     camera = topomap.nodes[0].camera
     pose = Localizer(topomap).localize(photo(5), camera)
@@ -104,7 +107,7 @@ def test_without_the_extra(photos: Path, capsys: pytest.CaptureFixture[str], mon
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--scale", "0.5"), "photos take a distance or --tag"),
+        (("--scale", "0.5"), "photos take a distance, --tag, or --scale none"),
         (("--tag", "-1"), "side of a tag in metres"),
         (("--poses", "opengl"), "those of photos are computed"),
         (("--trajectory", "slam", "--tag", "0.1"), "--trajectory photos"),
@@ -114,3 +117,66 @@ def test_options_that_do_not_fit(
     photos: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], said: str
 ):
     assert said in _refusal(capsys, photos, *options)
+
+
+@pytest.fixture(scope="module")
+def without_scale(photos: Path) -> Path:
+    target = photos.parent / "units.topo"
+    assert _build(photos, target, "--scale", "none") == 0
+    return target
+
+
+@needs_colmap
+def test_a_map_without_scale(
+    photos: Path, without_scale: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    answers = tmp_path / "answers.jsonl"
+    query = str(photos / NAMES[5])
+    assert main(["localize", str(without_scale), query, "--json", str(answers)]) == 0
+    assert " units, quat" in capsys.readouterr().out
+    (line,) = answers.read_text().splitlines()
+    answer = json.loads(line)
+    assert answer["localized"]
+    assert answer["scale"] == "none"
+    assert not [key for key in answer if key.endswith("_m")]
+    read = Localization.from_json(line)
+    assert not read.provenance.has_scale
+    assert " units" in repr(read)
+    assert read.to_json().keys() == answer.keys()
+
+    assert main(["info", str(without_scale), "--json", str(tmp_path / "facts.json")]) == 0
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    assert facts["scale"] == "none"
+    assert not [key for key in facts if key.endswith("_m")]
+    assert "topoloc scale sets it" in capsys.readouterr().out
+
+
+@needs_colmap
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["follow", "MAP", "PHOTOS", "--ros"],
+        ["follow", "MAP", "PHOTOS", "--mavlink", "udpout:127.0.0.1:9"],
+        ["merge", "MAP", "MAP2", "merged.topo"],
+        ["georeference", "MAP", "--origin", "50,8,100,0"],
+        ["certify", "MAP", "--walk", "PHOTOS"],
+        ["evaluate", "MAP", "PHOTOS"],
+        ["level", "MAP"],
+        ["route", "MAP", "0", "1"],
+        ["export", "MAP", "out.mcap", "--format", "mcap"],
+        ["update", "MAP", "PHOTOS"],
+        ["localize", "MAP", "PHOTOS", "--tolerance", "0.1,2"],
+    ],
+)
+def test_what_needs_metres_names_the_remedy(
+    photos: Path,
+    without_scale: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+):
+    (tmp_path / "second.topo").write_bytes(without_scale.read_bytes())
+    paths = {"MAP": without_scale, "MAP2": tmp_path / "second.topo", "PHOTOS": photos}
+    assert main([str(paths.get(one, one)) for one in command]) != 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"topoloc scale {without_scale}" in line

@@ -10,6 +10,7 @@ import pytest
 import photographed_room as room
 import room_frames
 import tiny_world
+from topoloc.apps.reconstruction import scale as scale_module
 from topoloc.apps.reconstruction.photos import PosedView, Reconstruction, SeenPoints
 from topoloc.apps.reconstruction.scale import ScaleSource, combine_sources, find_scale
 from topoloc.errors import RecordingError, TrajectoryError
@@ -50,7 +51,8 @@ def test_a_distance(photos: Reconstruction):
     text = f"{room.NAMES[0]},{room.NAMES[8]}={room.distance(0, 8):.3f}m"
     scale = find_scale(photos, [text], None, None)
     assert scale.metres == pytest.approx(UNIT, rel=0.002)
-    assert scale.sigma == pytest.approx(np.hypot(0.01 / room.distance(0, 8), 0.003), rel=0.01)
+    of_tape = 0.01 / room.distance(0, 8)
+    assert scale.sigma == pytest.approx(np.linalg.norm([of_tape, 0.01, 0.003]), rel=0.01)
     with pytest.raises(TrajectoryError, match="0 images are named IMG_9999"):
         find_scale(photos, [f"IMG_9999.jpg,{room.NAMES[8]}=1m"], None, None)
 
@@ -69,6 +71,21 @@ def test_no_source_and_no_tag_in_view(photos: Reconstruction):
     few = Reconstruction([replace(two, poses=poses)], photos.seen)
     with pytest.raises(RecordingError, match="tag 7 of APRILTAG_36h11 in 2 images"):
         find_scale(few, [], room.TAG_SIDE, None)
+
+
+def test_gnss_that_contradicts_a_tag_is_left_out_and_said(
+    photos: Reconstruction, monkeypatch: pytest.MonkeyPatch
+):
+    warned = list[str]()
+    monkeypatch.setattr(scale_module, "read_exif_places", lambda found: (np.zeros((9, 3)), [0] * 9))
+    monkeypatch.setattr(scale_module, "fit_places", lambda *places: (2.0 * UNIT, 0.1))
+    scale = find_scale(photos, [], room.TAG_SIDE, None, warned.append)
+    assert scale.metres == pytest.approx(UNIT, rel=0.01)
+    assert "GNSS in EXIF of 9 images" in warned[0]
+    assert "contradict each other" in warned[0]
+    alone = find_scale(photos, [], None, None)
+    assert alone.metres == pytest.approx(2.0 * UNIT)
+    assert alone.sigma == pytest.approx(0.1, rel=0.01)
 
 
 def test_depth_images():

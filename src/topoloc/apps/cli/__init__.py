@@ -48,7 +48,9 @@ _GROUPS = {
         "maps.history": "print the edits of a map",
         "maps.undo": "undo the last edit of a map, byte-identical",
         "maps.georeference": "set the position of a map on earth, for OGC GeoPoses",
+        "maps.scale": "set the scale of a map of images, by a distance or a tag",
         "maps.level": "make a map's world level: z up, floor at 0, as in a robot's plan",
+        "queries.calibrate": "find the mountings of a rig's cameras by their images in a map",
         "maps.export": "export to COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI",
     },
     "try and set up": {

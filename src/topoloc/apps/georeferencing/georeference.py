@@ -209,6 +209,7 @@ def georeference(
         raise ValueError("georeference takes one of origin, gnss and points")
     with edit_map(path, on_wait) as edit:
         topomap = edit.topomap
+        topomap.require_scale("a place on earth")
         posed = [image.world_from_cam for image in topomap.place_images] or [
             summary.world_from_cam for summary in topomap.summaries
         ]

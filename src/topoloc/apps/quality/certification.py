@@ -118,6 +118,7 @@ def certify(
     """
     config = config or LocalizerConfig()
     with TopoMetricMap.load(path) as topomap:
+        topomap.require_scale("a certificate")
         localizer, measured = Localizer(replace(topomap, certificate=None), config), topomap.file
         conditions = [
             *_localize_walks(localizer, walks, map_from_truth, progress),

@@ -12,7 +12,7 @@ from topoloc.apps.core_names import read_left_frame, sample_evenly
 
 _RUN, _NUM_RUNS = 10, 3  # images in a row, and such runs in a recording
 _MAX_SHARE = 0.3  # of a recording's images in one run
-_MAX_ERRORS = 0.5, 10.0  # metres, degrees: further off is another place
+_MAX_ERRORS = 0.5, 10.0  # metres (units without scale), degrees: further off is another place
 _MIN_LOCALIZED = 0.8
 
 
@@ -48,7 +48,10 @@ def check_kept_back(
     wrong = int(np.count_nonzero((metres > _MAX_ERRORS[0]) | (degrees > _MAX_ERRORS[1])))
     text = f"{sequences[0].name}: {len(errors)} of {num} images localized without their run's nodes"
     if errors:
-        text += f", {100 * np.median(metres):.1f} cm, {np.median(degrees):.2f} deg in the median"
+        median, unit = float(np.median(metres)), "units"
+        if topomap.config.has_scale:
+            median, unit = 100.0 * median, "cm"
+        text += f", {median:.2g} {unit}, {np.median(degrees):.2f} deg in the median"
     if wrong or len(errors) < _MIN_LOCALIZED * num:
         fault = f"{wrong} at another place: places may look alike" if wrong else "few"
         warn(f"{text}; {fault}; add images, and evaluate the map with others before it is used")

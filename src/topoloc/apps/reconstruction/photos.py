@@ -69,10 +69,11 @@ class SeenPoints:
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
     """Hold recordings with poses in an arbitrary unit. `seen` has one entry for each image of all
-    recordings, in their order."""
+    recordings, in their order. `is_fitted`: a camera had no calibration."""
 
     sequences: list[PosedView]
     seen: list[SeenPoints]
+    is_fitted: bool = False
 
 
 def reconstruct(
@@ -225,4 +226,6 @@ def _read_result(sequences: Sequence[StereoSequence], found: dict[str, Any]) -> 
         for one, (start, stop) in zip(sequences, pairwise(starts), strict=True)
     ]
     seen = [found["seen"][found["seen"][:, 0] == row, 1:] for row in range(len(poses))]
-    return Reconstruction(views, [SeenPoints(one[:, :2] - 0.5, one[:, 2]) for one in seen])
+    points = [SeenPoints(one[:, :2] - 0.5, one[:, 2]) for one in seen]
+    is_fitted = any(read_left_frame(one, 0).camera is None for one in sequences)
+    return Reconstruction(views, points, is_fitted)

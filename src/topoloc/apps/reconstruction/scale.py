@@ -19,10 +19,14 @@ from jaxtyping import Float
 from topoloc import Camera, RecordingError, Rigid3
 from topoloc.apps.core_names import prepare_frame, read_left_frame, sample_evenly, to_grey
 from topoloc.apps.formats.colmap import estimate_metric_scale
+from topoloc.apps.reconstruction.gnss import fit_places, read_exif_places
 from topoloc.apps.reconstruction.photos import PosedView, Reconstruction
 
+NO_SCALE = "none"  # stated instead of a source
+UNIT_DEPTH = 2.0  # units, as in a room
 # of any length in a reconstruction, relative: with calibrations, and with a fitted camera
 _SHAPE_SIGMAS = 0.003, 0.01
+_BEND_SIGMA = 0.01  # of one distance in a reconstruction against all of it, relative
 _TAPE_SIGMA = 0.01  # of a measured distance between two lenses, metres
 _DEPTH_SIGMA = 0.01  # of the scale of a depth sensor, relative
 _MAX_CONTRADICTION = 3.0  # standard deviations
@@ -47,6 +51,8 @@ def find_scale(
     distances: Sequence[str],
     tag: float | None,
     tell: Callable[[str], object] | None,
+    warn: Callable[[str], object] = lambda text: None,
+    known: Sequence[ScaleSource] = (),
 ) -> ScaleSource:
     """Return the metres in a unit by all sources together.
 
@@ -54,28 +60,38 @@ def find_scale(
         distances: of two images' cameras, as `estimate_metric_scale` has them.
         tag: length of a side of all tags' black squares, metres.
         tell: called with the result and its sources.
+        warn: called if places of EXIF contradict what is measured, and are left out.
+        known: further sources.
 
     Raises:
         RecordingError: there is no source, no usable tag is seen, or sources contradict each other.
         TrajectoryError: a distance is malformed, or its images have no pose.
     """
     name = found.sequences[0].name
-    sources = [_measure_distance(text, found) for text in distances]
+    sources = [*known, *(_measure_distance(text, found) for text in distances)]
     sources += [] if tag is None else _measure_tags(found, tag)
     sources += _measure_depth(found)
+    shape_sigma = _SHAPE_SIGMAS[found.is_fitted]
+    sources += _measure_gnss(found, sources, shape_sigma, warn)
     if not sources:
         raise RecordingError(
             f"{name}: images of one camera have no scale; measure one: --scale IMAGE_A,IMAGE_B="
             "METRES between the lenses at two images, or --tag METRES, the side of a printed"
             " AprilTag or ArUco marker in at least three of them (what was computed is kept); or"
-            " give the poses in metres, --trajectory FILE"
+            " --scale none for a map without scale, which `topoloc scale` sets later; or give the"
+            " poses in metres, --trajectory FILE"
         )
-    is_fitted = any(read_left_frame(one.base, 0).camera is None for one in found.sequences)
-    scale = combine_sources(name, sources, _SHAPE_SIGMAS[is_fitted])
+    scale = combine_sources(name, sources, shape_sigma)
     if tell is not None:
         named = ", ".join(f"{one.name} {one.metres / scale.metres:.3f}" for one in sources)
         tell(f"{name}: scale known to {100 * scale.sigma:.1f} % (relative to it: {named})")
     return scale
+
+
+def normalize_unit(found: Reconstruction) -> float:
+    """Return the factor to the unit of a map without scale, in which the median depth of its points
+    is `UNIT_DEPTH`: limits of the core in metres are then relative to that depth."""
+    return UNIT_DEPTH / float(np.median(np.concatenate([one.depths for one in found.seen])))
 
 
 def combine_sources(name: str, sources: Sequence[ScaleSource], shape_sigma: float) -> ScaleSource:
@@ -108,11 +124,31 @@ def _measure_distance(text: str, found: Reconstruction) -> ScaleSource:
         one for one in found.sequences if all(_has_image(one, name.strip()) for name in named)
     ]
     per_unit = estimate_metric_scale([text], (owners or found.sequences)[0])
-    return ScaleSource(f"distance {text}", per_unit, _TAPE_SIGMA / float(metres_text))
+    sigma = math.hypot(_TAPE_SIGMA / float(metres_text), _BEND_SIGMA)
+    return ScaleSource(f"distance {text}", per_unit, sigma)
 
 
 def _has_image(sequence: PosedView, name: str) -> bool:
     return any(name in (other, other.rpartition("/")[2]) for other in sequence.names)
+
+
+def _measure_gnss(
+    found: Reconstruction,
+    others: Sequence[ScaleSource],
+    shape_sigma: float,
+    warn: Callable[[str], object],
+) -> list[ScaleSource]:
+    """Return the scale by places of EXIF, if they determine it and agree with what was measured."""
+    positions, places = read_exif_places(found)
+    if (fit := fit_places(positions, places)) is None:
+        return []
+    gnss = ScaleSource(f"GNSS in EXIF of {len(places)} images", *fit)
+    try:
+        combine_sources(found.sequences[0].name, [*others, gnss], shape_sigma)
+    except RecordingError as error:
+        warn(f"{error}; GNSS is left out")
+        return []
+    return [gnss]
 
 
 def _measure_depth(found: Reconstruction) -> list[ScaleSource]:
@@ -161,8 +197,9 @@ def _measure_tags(found: Reconstruction, side: float) -> list[ScaleSource]:
         for row, (pose, camera) in enumerate(zip(sequence.poses, sequence.cameras, strict=True)):
             if pose is not None and camera is not None:
                 grey = to_grey(read_left_frame(sequence, row).image)
+                of_size = camera.rescaled(grey.shape[1], grey.shape[0])
                 for tag, corners in _detect_tags(grey):
-                    views[tag].append((pose, camera, corners))
+                    views[tag].append((pose, of_size, corners))
     many = {tag: one for tag, one in views.items() if len(one) >= _MIN_TAG_VIEWS}
     sources = [one for tag in sorted(many) if (one := _fit_tag(tag, many[tag], side)) is not None]
     if not sources:

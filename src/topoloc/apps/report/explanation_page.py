@@ -79,9 +79,10 @@ def verdict(explanation: Explanation) -> str:
         reason = result.reason.replace("_", " ")
         return f"Not localized: {reason}. {len(explanation.poses)} pose proposals were tried."
     x, y, z = result.world_from_cam.translation
-    sigmas = f"{100.0 * result.position_sigma_m:.1f} cm, {result.rotation_sigma_deg:.2f} deg"
+    unit = "m" if result.provenance.has_scale else "units"
+    sigmas = f"{result.position_sigma_text}, {result.rotation_sigma_deg:.2f} deg"
     return (
-        f"At ({x:.2f}, {y:.2f}, {z:.2f}) m near node {result.node_id}, probability"
+        f"At ({x:.2f}, {y:.2f}, {z:.2f}) {unit} near node {result.node_id}, probability"
         f" {result.probability:.2f}, standard deviations {sigmas}."
     )
 

@@ -98,6 +98,7 @@ def _describe_map(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
         "num_points": sum(summary.num_points for summary in topomap.summaries),
         "num_points_shown": num_shown,
         "length_m": topomap.length_m,
+        **({} if topomap.config.has_scale else {"scale": "none"}),
         "sessions": sessions,
         "certificate": _describe_certificate(topomap),
     }

@@ -21,6 +21,7 @@ from topoloc.apps.cli.mapping.map_jobs import (
     split_recording,
 )
 from topoloc.apps.cli.maps.atlas import JoinedTiles, join_overlapping_tiles
+from topoloc.apps.cli.maps.info import format_mapped
 from topoloc.apps.cli.maps.level import find_and_move
 from topoloc.apps.cli.output import (
     CameraOption,
@@ -79,12 +80,12 @@ class Command:
     scale: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(
-            metavar="METRES|IMAGE_A,IMAGE_B=METRES",
+            metavar="METRES|IMAGE_A,IMAGE_B=METRES|none",
             help_behavior_hint="(distances: several times)",
         ),
     ] = ()
     """Metres in a unit of the poses of models without a scale; or a measured distance between the
-    cameras of two images."""
+    cameras of two images. `none`: photos make a map without scale (`topoloc scale` sets it)."""
     tag: Annotated[float | None, option("METRES")] = None
     """Side of printed AprilTags or ArUco markers: the scale of photos."""
     topics: Topics = None
@@ -129,13 +130,18 @@ class Command:
         check_outputs([target if self.ray is None else None, self.json], [*recordings, *read])
         if self.tag is not None and not 0.0 < self.tag < 100.0:
             raise UsageError(f"--tag is the side of a tag in metres, such as 0.16, not {self.tag}")
-        if any("=" not in text and not _is_positive(text) for text in self.scale):
+        if "none" in self.scale and (self.tag, self.d_thresh, len(self.scale)) != (None, None, 1):
+            raise UsageError("--scale none goes without --tag, --d-thresh and other --scale")
+        if any("=" not in one and one != "none" and not _is_positive(one) for one in self.scale):
             raise UsageError(
                 "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not"
                 f" {self.scale[0][:80]}"
             )
-        if self.level and self.ray is not None:
-            raise UsageError("--level goes without --ray: tiles of an atlas keep their worlds")
+        if self.level and (self.ray is not None or "none" in self.scale):
+            raise UsageError(
+                "--level goes without --ray, as tiles of an atlas keep their worlds, and without"
+                " --scale none, as it needs metres"
+            )
         settings = read_settings(self.config)
         map_job = self._map_job(recordings, settings)
         if self.ray is not None:
@@ -183,7 +189,7 @@ class Command:
             size = f"{info['num_nodes']} nodes, {info['num_points']} points"
             source = " and ".join(sorted(set(poses_from)))
             print(
-                f"{target}: {size}, {info['bytes'] / 1e6:.2f} MB, {info['length_m']:.1f} m mapped,"
+                f"{target}: {size}, {info['bytes'] / 1e6:.2f} MB, {format_mapped(info)} mapped,"
                 f" poses from {source}"
             )
         write_json(self.json, info)

@@ -43,7 +43,8 @@ from topoloc.apps.formats.colmap import estimate_metric_scale
 from topoloc.apps.reconstruction.kept_back import check_kept_back
 from topoloc.apps.reconstruction.key_frames import select_key_frames
 from topoloc.apps.reconstruction.photos import reconstruct
-from topoloc.apps.reconstruction.scale import find_scale
+from topoloc.apps.reconstruction.scale import NO_SCALE, find_scale, normalize_unit
+from topoloc.apps.reconstruction.work_folders import open_work_folder
 from topoloc.plugin import cache_folder
 
 MIN_OVERLAP = 3
@@ -122,8 +123,9 @@ class MapJob:
         sequences: list[StereoSequence],
         progress: Progress,
         tell: Callable[[str], None] | None,
-    ) -> tuple[list[StereoSequence], float]:
-        """Return single images with computed poses in metres, and the relative sigma of these."""
+    ) -> tuple[list[StereoSequence], float | None]:
+        """Return single images with computed poses in metres, and the relative sigma of these. It
+        is None without a scale, and lengths are then in units that follow from the depth."""
         options, images = self.pose_options, replace(self, pose_options=PoseOptions())
         measured = re.split("[,=]", ",".join(options.scale))
         for k, path in enumerate(self.recordings):
@@ -132,8 +134,13 @@ class MapJob:
         digest = replace(images, build=BuildConfig()).digest()
         names = "\n".join([digest, *(name for one in sequences for name in one.names)])
         work = sha256(names.encode("utf-8", "surrogateescape")).hexdigest()[:32]
-        found = reconstruct(sequences, cache_folder() / "reconstructions" / work, progress, _warn)
-        scale = find_scale(found, options.scale, options.tag, tell)
+        opened = open_work_folder(work, lambda: _warn("waiting for a build of the same images"))
+        with RecordingError.at(f"cannot write {cache_folder()}", OSError), opened as path:
+            found = reconstruct(sequences, path, progress, _warn)
+        if options.scale == (NO_SCALE,):
+            factor = normalize_unit(found)
+            return [scale_poses(one, factor) for one in found.sequences], None
+        scale = find_scale(found, options.scale, options.tag, tell, _warn)
         return [scale_poses(one, scale.metres) for one in found.sequences], scale.sigma
 
     def split_by_recording(self) -> list[MapJob]:
@@ -193,6 +200,8 @@ class MapJob:
         if "photos" in trajectories:
             self._check_photo_options(trajectories)
             return sequences, list(trajectories)
+        if NO_SCALE in self.pose_options.scale:
+            raise UsageError("--scale none is for images without poses (--trajectory photos)")
         if "slam" in trajectories:
             if self.pose_options.poses is not None:
                 raise UsageError("--poses needs given poses; slam computes its own")
@@ -209,9 +218,10 @@ class MapJob:
             raise UsageError("--trajectory photos applies to all recordings or to none")
         if self.pose_options.poses is not None:
             raise UsageError("--poses needs given poses; those of photos are computed")
-        if any("=" not in text for text in self.pose_options.scale):
+        if any("=" not in text and text != NO_SCALE for text in self.pose_options.scale):
             raise UsageError(
-                "--scale METRES needs the recordings' own poses; photos take a distance or --tag"
+                "--scale METRES needs the recordings' own poses; photos take a distance, --tag, or"
+                " --scale none"
             )
 
     def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:

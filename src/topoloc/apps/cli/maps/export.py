@@ -20,7 +20,7 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 from topoloc.apps.cli.tile_option import TileOption, select_world
-from topoloc.apps.export.formats import ExportFormat, find_export_format, write_scene
+from topoloc.apps.export.formats import FORMATS, ExportFormat, find_export_format, write_scene
 from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.result_files import create_results_scene
 from topoloc.apps.viewer.scene import Scene
@@ -80,6 +80,8 @@ class Command:
 
         def load_map(path: str) -> Scene:
             with TopoMetricMap.load(path) as topomap, progress_bar() as progress:
+                if form is FORMATS["mcap"]:
+                    topomap.require_scale("MCAP")
                 return create_map_scene(
                     topomap, place.name, self.session, form.with_points, progress
                 )

@@ -84,13 +84,19 @@ class Command:
         return 0
 
 
+_NO_SCALE = "none: lengths are in units of the map (topoloc scale sets it)"
+
+
 def _print(info: dict[str, Any], topomap: TopoMetricMap) -> None:
     certificate = topomap.certificate
     nodes, features = (info["config"].get(name, {}) for name in ("nodes", "features"))
     normalization, nan = features.get("normalization"), float("nan")
     geo, unknown = info["georeference"], "unknown (topoloc georeference sets it)"
     place = unknown if geo is None else str(Georeference.from_json(geo))
-    extent = " x ".join(f"{e:.1f}" for e in info["extent_m"])
+    has_scale = "scale" not in info
+    unit = "m" if has_scale else "units"
+    extent = " x ".join(f"{e:.1f}" for e in info["extent_m" if has_scale else "extent"])
+    extent = f"{extent} {unit}"
     d_thresh, lambda_rot = (nodes.get(name, nan) for name in ("d_thresh", "lambda_rot"))
     kinds = ", ".join(info["kinds"]) + (f", normalization {normalization}" * bool(normalization))
     floors = "look alike" if info["config"].get("look_alike_floors") else "do not look alike"
@@ -104,14 +110,15 @@ def _print(info: dict[str, Any], topomap: TopoMetricMap) -> None:
             ("side nodes", str(info["num_side_nodes"])),
             ("place images", str(info["num_place_images"])),
             ("junctions", _format_junctions(info["junctions"])),
-            ("mapped", f"{info['length_m']:.1f} m, extent {extent} m"),
+            ("mapped", f"{format_mapped(info)}, extent {extent}"),
+            *([] if has_scale else [("scale", _NO_SCALE)]),
             ("recordings", ", ".join(of_sessions or info["recordings"])),
             ("on earth", place),
             *(
                 ("coarse localizer", _format_coarse(facts, info["default_coarse"]))
                 for facts in info["coarse_models"]
             ),
-            ("Eq. 1", f"D_thresh {d_thresh:.3g} m, lambda {lambda_rot:.3g} m/rad"),
+            ("Eq. 1", f"D_thresh {d_thresh:.3g} {unit}, lambda {lambda_rot:.3g} {unit}/rad"),
             ("features", kinds),
             ("floors", f"{floors} (topoloc update --look-alike-floors changes it)"),
             ("certificate", _describe_certificate(info["certificate"])),
@@ -121,6 +128,11 @@ def _print(info: dict[str, Any], topomap: TopoMetricMap) -> None:
         ]
     )
     print_quarters(certificate.quarters if certificate else [])
+
+
+def format_mapped(info: dict[str, Any]) -> str:
+    """Return the mapped length of `TopoMetricMap.describe` with its unit."""
+    return f"{info['length_m']:.1f} m" if "length_m" in info else f"{info['length']:.1f} units"
 
 
 def _format_junctions(junctions: list[dict[str, Any]]) -> str:
@@ -160,7 +172,8 @@ class MapGraph:
 
     Facts of a node: session, name, world_from_cam (x, y, z in metres; qw, qx, qy, qz), number of
     points, number of outgoing edges, and whether it is the node nearest to a junction.
-    Facts of an edge: metres, source_from_target, and how often mapping images traversed it.
+    Facts of an edge: metres (units of a map without scale), source_from_target, and how often
+    mapping images traversed it.
     """
 
     nodes: dict[int, dict[str, Any]]
@@ -184,11 +197,12 @@ def build_graph(topomap: TopoMetricMap) -> MapGraph:
         for s in topomap.summaries
     }
     walked, edges = _count_traversals(topomap), {}
+    unit = "metres" if topomap.config.has_scale else "units"
     for edge in topomap.edges:
         source_from_target = poses[edge.source_id].inverse() @ poses[edge.target_id]
-        metres = float(np.linalg.norm(source_from_target.translation))
+        length = float(np.linalg.norm(source_from_target.translation))
         pair = (edge.source_id, edge.target_id)
-        edges[pair] = {"metres": metres, **_pose(source_from_target), "times": walked[pair]}
+        edges[pair] = {unit: length, **_pose(source_from_target), "times": walked[pair]}
     return MapGraph(nodes, edges)
 
 

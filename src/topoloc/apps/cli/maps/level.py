@@ -84,6 +84,7 @@ def find_and_move(
     with TopoMetricMap.load(path) as topomap, MapError.at(path):
         if not topomap.summaries:
             raise MapError("it has no mapping picture")
+        topomap.require_scale("the height of the floor")
         known = None if points is None else read_plan(Path(points), topomap)
         level = find_level_world(topomap, pose, known, up, camera_height)
     move_map(path, level.new_from_old, "level", print_waiting)

@@ -71,6 +71,7 @@ class Command:
 
     def _open_map(self, path: str) -> Maps:
         with TopoMetricMap.load(Path(path)) as topomap:
+            topomap.require_scale("a route")
             yield {}, topomap, Rigid3.identity()
 
     def _open_tiles(self, atlas: Atlas) -> Maps:

@@ -111,6 +111,7 @@ class Command:
         tile_id = self._select_tile(localizer)
         with localizer.in_tile(tile_id) as in_tile:
             topomap = in_tile.topomap
+            topomap.require_scale("an evaluation")
             info = topomap.describe(topomap.file.path if topomap.file else self.map)
         opened = self._open_recordings()
         with progress_bar() as progress:
@@ -261,6 +262,8 @@ def _print(evaluation: dict[str, Any]) -> None:
     if e["not_localized"]:
         reasons = [f"{reason} {count}" for reason, count in e["not_localized"].items()]
         facts.append(("not localized", ", ".join(reasons)))
+    if left_out := [f"{camera} {count}" for camera, count in e.get("left_out", {}).items()]:
+        facts.append(("cameras left out", ", ".join(left_out)))
     times = [f"{stage} {ms:.1f}" for stage, ms in e["median_times_ms"].items()]
     facts.append(("median ms", ", ".join(times)))
     facts += [("calibration", f"{one['recording']}: {one['detail']}") for one in e["calibrations"]]

@@ -194,9 +194,11 @@ class Command:
         )
 
     def _check_world(self, localizer: Localizer) -> None:
-        """Warn if z of the map does not point up. Raises UsageError: it has several worlds."""
+        """Warn if z of the map does not point up. Raises UsageError: it has several worlds;
+        MapError: it has no scale."""
         if len(localizer.tile_ids) > 1:
             raise UsageError("robots need poses of one world, and tiles have their own")
+        localizer.topomap.require_scale("a robot")
         axes = [one.world_from_cam.rotation[2, 1] for one in localizer.topomap.summaries]
         max_tilt = 40.0  # degrees of the mean camera
         if axes and np.degrees(np.arccos(-np.mean(axes))) > max_tilt:

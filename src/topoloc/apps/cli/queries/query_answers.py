@@ -183,9 +183,12 @@ def format_answer(answer: QueryAnswer) -> str:
     tile = "" if result.provenance.tile is None else f"  tile {result.provenance.tile}"
     x, y, z = result.world_from_cam.translation
     w, i, j, k = result.world_from_cam.quat_wxyz()
-    sigmas = f"{format_length(result.position_sigma_m)} {result.rotation_sigma_deg:.2f} deg"
+    has_scale = result.provenance.has_scale
+    at = f"at {x:.3f} {y:.3f} {z:.3f} {'m' if has_scale else 'units'}"
+    length = format_length(result.position_sigma_m) if has_scale else result.position_sigma_text
+    sigmas = f"{length} {result.rotation_sigma_deg:.2f} deg"
     return (
-        f"{answer.query}  {state}at {x:.3f} {y:.3f} {z:.3f} m, quat wxyz {w:.4f} {i:.4f} {j:.4f}"
+        f"{answer.query}  {state}{at}, quat wxyz {w:.4f} {i:.4f} {j:.4f}"
         f" {k:.4f}  p {result.probability:.2f}  sigma {sigmas}{tile}  node {result.node_id} "
         f" ({result.num_inliers} of {result.num_matches} matches){focal}{ms}"
     )

@@ -256,7 +256,7 @@ export class Viewer {
 
   tellSummary() {
     const { name, map } = this.document;
-    const said = [`${map.num_nodes} nodes, ${map.num_points.toLocaleString("en")} points, ${map.length_m.toFixed(0)} m mapped.`];
+    const said = [`${map.num_nodes} nodes, ${map.num_points.toLocaleString("en")} points, ${map.length_m.toFixed(0)} ${map.scale ? "units" : "m"} mapped.`];
     if (map.certificate) {
       const outdated = map.certificate.is_outdated ? " (outdated: the map was edited since)" : "";
       said.push(`Certified: ${map.certificate.promise}${outdated}.`);

@@ -20,6 +20,7 @@ const STATES = {
 const MAX_ERROR = 0.5; // metres; an answer further off is a false accept
 
 export function lengthText(metres) {
+  if (metres === undefined) return "a length without scale"; // of a map without scale
   if (metres >= 1) return `${metres.toFixed(2)} m`;
   if (metres >= 0.001) return `${(100 * metres).toFixed(metres < 0.1 ? 1 : 0)} cm`;
   return `${(1000 * metres).toFixed(1)} mm`;
