@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from built_room import unseen_views
 from tiny_world import CAMERA
-from topoloc.localization.decision import CHECKS
+from topoloc.localization.decision import CHECKS, check_threshold
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.map_query import MapQuery
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.search import Trace
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -30,3 +33,19 @@ def test_the_trace_collects_the_findings_of_an_answer(room_map: Path):
     names = [finding.check for finding in trace.findings]
     assert names[:2] == ["camera", "exact pose"]
     assert all(finding.text for finding in trace.findings)
+
+
+def test_pixels_of_a_door_alone_leave_its_copies_possible(room_map: Path):
+    with TopoMetricMap.load(room_map) as topomap:
+        context = Localizer(topomap).context
+        image = QueryImage(unseen_views()[0][0], CAMERA)
+        query = MapQuery(context, context.searches(image, StageClock(), Deadline()))
+        answer = query.search_all()
+        best, pose = answer.best, answer.pose
+        assert best is not None
+        assert pose is not None
+        assert pose.probability > 0.98
+        assert check_threshold(query, answer) is None
+        narrow = replace(best, evidence=replace(best.evidence, spread=0.1, doubt=0.1))
+        limited = replace(answer, best=narrow)
+        assert limited.after(check_threshold(query, limited)).pose.probability < 0.91

@@ -1,12 +1,19 @@
-"""Test distances between views: they equal Eq. 1 for upright cameras and ignore quarter turns."""
+"""Test distances between views: they equal Eq. 1 for upright cameras and ignore quarter turns.
+Nodes for a view beside the path are those that show it."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tiny_world import CAMERA, path_pose
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.localization.feature_map import FeatureMap
+from topoloc.localization.guided import count_seen_points
 from topoloc.mapping.nodes import NodePoses, node_distances, node_distances_for_any_roll
+from topoloc.mapping.topomap import TopoMetricMap
 
 NODES = NodePoses.from_poses(
     [Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.5, 0.0])), np.array([1.0, 0.0, 0.0]))]
@@ -29,3 +36,25 @@ def test_quarter_turns_change_nothing(num_quarters: int):
         node_distances_for_any_roll(camera, NODES, 3.0),
         atol=1e-7,
     )
+
+
+def test_a_view_aside_takes_nodes_that_show_it(room_map: Path):
+    with TopoMetricMap.load(room_map) as topomap:
+        opened = FeatureMap(topomap)
+        on_path = path_pose(0.5)
+        nearest = opened.nearest(on_path, 3)
+        assert opened.showing(on_path.inverse(), CAMERA, 3) == nearest
+        aside = on_path @ Rigid3(exp_so3(np.array([0.0, 0.9, 0.0])), np.zeros(3))
+        cam_from_world, centres = aside.inverse(), opened.node_poses.centres
+        counts = np.array(
+            [
+                count_seen_points(points, centres[row], cam_from_world, CAMERA)
+                for row, points in enumerate(opened.local_maps(range(len(centres))))
+            ]
+        )
+        chosen = opened.showing(cam_from_world, CAMERA, 3)
+        assert chosen != opened.nearest(aside, 3), "the test must show a difference"
+        assert counts[chosen].min() >= 0.5 * counts.max()
+        distances = opened.distances(aside)
+        others = np.setdiff1d(np.flatnonzero(counts >= 0.5 * counts.max()), chosen)
+        assert distances[chosen].max() <= distances[others].min()

@@ -14,6 +14,7 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.guided import (
     GuidedConfig,
     count_chance_matches,
+    count_seen_points,
     match_guided,
     predict_key_points,
     select_visible_points,
@@ -114,6 +115,14 @@ def test_nothing_is_visible_behind_the_camera():
     local_map = LocalMap.of_node(_node(np.random.default_rng(3)))
     backwards = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     assert len(select_visible_points(local_map, backwards, CAMERA)[0]) == 0
+
+
+def test_points_are_seen_from_the_side_of_their_node_only():
+    points = LocalMap.of_node(_node(np.random.default_rng(7)))
+    at_node, behind = Rigid3.identity(), Rigid3(np.diag([-1.0, 1.0, -1.0]), np.array([0, 0, 6.0]))
+    assert count_seen_points(points, np.zeros(3), at_node, CAMERA) == NUM_POINTS
+    assert len(select_visible_points(points, behind, CAMERA)[0]) > 0.3 * NUM_POINTS
+    assert count_seen_points(points, np.zeros(3), behind, CAMERA) == 0
 
 
 def test_chance_finds_next_to_nothing_among_descriptors_that_differ():

@@ -69,6 +69,17 @@ def test_patches_agree_at_the_right_pose_only(room: TopoMetricMap):
     assert right.log_odds(0.0, weights) > wrong.log_odds(0.0, weights) + 1.0
 
 
+def test_surfaces_are_not_seen_from_behind(room: TopoMetricMap):
+    query, _ = _refused(room, unseen_views(step=0.75)[0][0], -2.0)
+    search = query.searches[0]
+    best = search.belief.hypotheses[0]
+    half_turn = np.diag([-1.0, 1.0, -1.0])  # about the camera's y axis
+    there = np.array([0.0, 0.0, 2.0 * best.fit.median_depth])
+    behind = Rigid3(half_turn, half_turn @ -there) @ best.fit.pose.cam_from_world
+    fit = replace(best.fit, pose=replace(best.fit.pose, cam_from_world=behind))
+    assert measure_pixels(search, replace(best, fit=fit)) is None
+
+
 def test_a_right_pose_with_low_odds_is_answered_and_explained(room: TopoMetricMap):
     image, truth = unseen_views(step=0.75)[0]
     query, refused = _refused(room, image, -2.0)

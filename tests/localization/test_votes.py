@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig
 from topoloc.localization.exact.pixel_evidence import weigh_pixels
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Search, Trace
+from topoloc.localization.search import Proposal, Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import Image, NodeScore
@@ -96,9 +97,34 @@ def test_a_blank_image_has_no_place(room: TopoMetricMap):
     assert isinstance(Localizer(room).localize(blank, CAMERA), NotLocalized)
 
 
-def test_an_image_whose_retrieved_nodes_agree_by_chance_costs_no_votes(
+def test_votes_come_last_if_the_retrieved_nodes_agree_by_chance(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(propose, "count_votes", lambda _: pytest.fail("votes were counted"))
+    order, count_votes = list[str](), propose.count_votes
+
+    def count_walls(search: Search) -> Iterator[Proposal]:
+        order.append("virtual views")
+        yield from ()
+
+    monkeypatch.setattr(map_query, "propose_virtual_views", count_walls)
+    monkeypatch.setattr(
+        propose, "count_votes", lambda search: order.append("votes") or count_votes(search)
+    )
     for picture, _ in unseen_views(seed=1, step=4.0):
+        order.clear()
         assert isinstance(Localizer(room).localize(picture, CAMERA), NotLocalized)
+        assert order == ["virtual views", "votes"]
+
+
+@pytest.mark.parametrize("is_by_chance", [True, False])
+def test_votes_find_the_place_if_retrieval_agrees_by_chance(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, is_by_chance: bool
+):
+    monkeypatch.setattr(LocalizerConfig, "num_chance_inliers", 7 if is_by_chance else 0)
+    monkeypatch.setattr(map_query, "propose_node_viewpoints", lambda _: iter(()))
+    localizer, trace = Localizer(room, coarse=OtherRoomFirst(room)), Trace()
+    for picture, truth in unseen_views():
+        found = localizer.localize(picture, CAMERA, trace=trace)
+        assert isinstance(found, Localization)
+        assert translation_error(found.world_from_cam, truth) < 0.05
+    assert "votes" in {one.source for one in trace.tried}

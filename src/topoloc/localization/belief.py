@@ -148,7 +148,7 @@ class Belief:
         same_as_new = frozenset(
             k
             for k, other in enumerate(self.all_hypotheses)
-            if _agree_on_pose(hypothesis, other, config)
+            if agree_on_pose(hypothesis, other, config)
         )
         all_hypotheses, same_pose = (
             (*self.all_hypotheses, hypothesis),
@@ -187,7 +187,7 @@ def _rank_hypotheses(
     )
 
 
-def _agree_on_pose(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
+def agree_on_pose(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
     """Return whether `is_same_fit` holds, or the covariances allow both to be the same pose."""
     return is_same_fit(a.fit, b.fit, config) or a.world_from_cam.is_same(
         b.world_from_cam, covariance=a.covariance + b.covariance, max_square=_CHI_SQUARE_6_AT_95

@@ -23,6 +23,7 @@ from topoloc.errors import MapError, ObjectStoreError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import Answer, Finding, ResultWithInliers, probability_within
 from topoloc.localization.belief import MIN_ALTERNATIVE_RATIO, Hypothesis
+from topoloc.localization.evidence import highest_probability
 from topoloc.localization.exact.appearance import check_colours
 from topoloc.localization.exact.last_step import refine_answer
 from topoloc.localization.exact.pixel_evidence import weigh_pixels
@@ -263,14 +264,18 @@ def widen_by_scale(query: MapQuery, answer: Answer) -> Finding | None:
 
 def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:
     """Refuse a pose whose probability is below the threshold of the map's certificate, which
-    looks as on another floor, or which is less precise than the tolerance."""
+    looks as on another floor, or which is less precise than the tolerance. The probability of
+    others is limited by the covariance, now that the last step has changed it, and by how little
+    of the image agrees: pixels of a door agree with each of its copies."""
     pose, certified = answer.pose, query.opened.topomap.certificate
     config = query.opened.config.evidence
     if pose is None:
         return None
     least = 0.0 if certified is None else certified.applied_min_probability
-    if pose.probability < least:
-        text = f"probability {pose.probability:.3g}, below the map's certified threshold"
+    precise = highest_probability(pose.camera_covariance, config)
+    probability = min(pose.probability, precise, _highest_of_part(answer))
+    if probability < least:
+        text = f"probability {probability:.3g}, below the map's certified threshold"
         text = f"{text} {least:.3g}"
         return Finding("threshold", text, refusal=("too_few_inliers", text))
     if pose.probability < config.min_probability:
@@ -283,7 +288,23 @@ def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:
     if asked is not None and (sigmas[0] > asked[0] or sigmas[1] > asked[1]):
         text = "in the map, but where is known to {:.2f} m and {:.1f} degrees only".format(*sigmas)
         return Finding("threshold", text, refusal=("imprecise", text))
+    if probability < pose.probability:
+        text = "only a small part of the image agrees"
+        if probability == precise:
+            text = "standard deviations of {:.2f} m and {:.1f} degrees".format(*sigmas)
+        text = f"{text}: at most a probability of {probability:.2f}"
+        return Finding("threshold", text, facts={"probability": probability})
     return None
+
+
+def _highest_of_part(answer: Answer) -> float:
+    """Return the highest probability of a pose by the part of the image where points agree."""
+    if answer.best is None:
+        return 1.0
+    evidence = answer.best.evidence
+    weights = answer.search.weights.for_evidence(evidence)
+    as_precise = replace(evidence, doubt=min(evidence.doubt, 0.1))  # the covariance limits it, too
+    return 1.0 / (1.0 + math.exp(-weights.highest_log_odds(as_precise)))
 
 
 Check = Callable[[MapQuery, Answer], Finding | None]

@@ -67,18 +67,17 @@ def compute_normalized_uncertainty(
 
 
 def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceConfig) -> float:
-    """Return the highest probability that agrees with a covariance of cam_from_world.
+    """Return the highest probability that agrees with a pose covariance (metres, radians).
 
-    The covariance is an upper bound: rho is that of the worse parts of a map. So it alone refuses
-    no pose. The probability is 0.95 if a standard deviation equals its tolerance.
+    It is that of a normal error within the tolerance. At least `min_probability`, for a lack of
+    precision alone refuses no pose: rho is that of the worse parts of a map.
     """
-    variances = np.diag(covariance)
     max_translation, max_rotation_deg = config.max_errors
-    metres = math.sqrt(variances[:3].sum()) / max_translation
-    degrees = math.degrees(math.sqrt(variances[3:].sum())) / max_rotation_deg
-    normal_95_percent = 1.96
-    within = probability_within_tolerance(max(metres, degrees) / normal_95_percent)
-    return max(within, config.min_probability)
+    metres, radians = (
+        math.sqrt(np.trace(part)) for part in (covariance[:3, :3], covariance[3:, 3:])
+    )
+    doubt = max(metres / max_translation, math.degrees(radians) / max_rotation_deg)
+    return max(probability_within_tolerance(doubt), config.min_probability)
 
 
 def sample_rows(count: int) -> Int[np.ndarray, " k"]:

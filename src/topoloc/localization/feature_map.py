@@ -19,7 +19,7 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact.patch_alignment import NodeTemplate
-from topoloc.localization.guided import predict_key_points
+from topoloc.localization.guided import count_seen_points, predict_key_points
 from topoloc.localization.map_facts.repetition import (
     NUM_NEIGHBOURS,
     digest_of,
@@ -236,6 +236,31 @@ class FeatureMap:
         order = np.argsort(self.distances(world_from_cam), kind="stable")
         num_nodes = min(num_nodes, len(self.node_ids) - len(self._masked_rows))
         return [Row(row) for row in order[:num_nodes].tolist()]
+
+    def showing(self, cam_from_world: Rigid3, camera: Camera, num_nodes: int) -> list[Row]:
+        """Return the rows of the nodes nearest to a camera of those that show what it sees.
+
+        Beside the path the nearest nodes by Eq. 1 look past what the camera sees, and nodes farther
+        back show it. Those count that show half as many points as the best one.
+        """
+        max_num_d_thresh, max_read, min_share = 5.0, 24, 0.5
+        world_from_cam = cam_from_world.inverse()
+        distances = self.distances(world_from_cam)
+        if distances.min() <= max_num_d_thresh * self.d_thresh:
+            return self.nearest(world_from_cam, num_nodes)
+        centres = self.node_poses.centres
+        apart = np.linalg.norm(centres - world_from_cam.translation, axis=1)
+        apart[np.isinf(distances)] = np.inf
+        near = as_rows(np.argsort(apart, kind="stable")[: min(max_read, np.isfinite(apart).sum())])
+        counts = np.array(
+            [
+                count_seen_points(points, centres[row], cam_from_world, camera)
+                for row, points in zip(near, self.local_maps(near), strict=True)
+            ]
+        )
+        shows = counts >= min_share * counts.max()
+        order = np.lexsort((distances[near], ~shows))
+        return [near[k] for k in order[:num_nodes]]
 
 
 class _MaskedCoarseLocalizer:

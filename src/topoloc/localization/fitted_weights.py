@@ -66,6 +66,12 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     few_points: ClassVar[float] = 0.0
     """The covariance of few points is not inflated."""
 
+    def highest_log_odds(self, evidence: Evidence) -> float:
+        """Return the limit of the log-odds: that of a door if the points lie in a small part."""
+        if evidence.spread >= self.narrow_spread:
+            return math.inf
+        return self.max_narrow_log_odds + self.narrow_doubt * (_log_doubt(evidence) - math.log(0.1))
+
     @property
     def as_vector(self) -> tuple[float, ...]:
         """Return the weights in the order of `features`, without the bias."""
@@ -163,6 +169,10 @@ class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
             _log_doubt(e),
         )
 
+    def highest_log_odds(self, evidence: Evidence) -> float:
+        """Return infinity: virtual views have no limit."""
+        return math.inf
+
     def is_clear(self, log_odds: float) -> bool:
         """Return True: this evidence is compared with all other virtual views already."""
         return True
@@ -172,10 +182,7 @@ def compute_log_odds(evidence: Evidence, weights: EvidenceWeights | VirtualViewW
     """Compute the log-odds that a pose with this evidence is right."""
     features = weights.features(evidence)
     log_odds = sum(w * x for w, x in zip(weights.as_vector, features, strict=True)) + weights.bias
-    if isinstance(weights, EvidenceWeights) and evidence.spread < weights.narrow_spread:
-        by_doubt = weights.narrow_doubt * (_log_doubt(evidence) - math.log(0.1))
-        return min(log_odds, weights.max_narrow_log_odds + by_doubt)
-    return log_odds
+    return min(log_odds, weights.highest_log_odds(evidence))
 
 
 class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):

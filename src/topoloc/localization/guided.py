@@ -150,6 +150,21 @@ def select_visible_points(
     return rows, pixels[rows]
 
 
+def count_seen_points(
+    local_map: LocalMap, centre: Float[np.ndarray, "3"], cam_from_world: Rigid3, camera: Camera
+) -> int:
+    """Count the points in the camera's view that it sees from nearly the same side as the node.
+
+    `centre` is the node's position (world).
+    """
+    min_cosine = 0.6
+    rows, _ = select_visible_points(local_map, cam_from_world, camera)
+    points = local_map.points_world[rows]
+    rays = points - centre, points - cam_from_world.inverse().translation
+    lengths = np.prod([np.linalg.norm(one, axis=1) for one in rays], axis=0)
+    return int(np.count_nonzero(np.sum(rays[0] * rays[1], axis=1) > min_cosine * lengths))
+
+
 def _project_points(
     local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:

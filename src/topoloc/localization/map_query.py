@@ -23,11 +23,13 @@ from topoloc.localization.map_context import MapContext
 from topoloc.localization.propose import (
     propose_first,
     propose_from_other_features,
+    propose_last,
     propose_node_viewpoints,
     propose_repetitions,
     propose_similar_places,
     propose_voted_places,
 )
+from topoloc.localization.propose_twins import propose_twins
 from topoloc.localization.refine import confirm_hypotheses
 from topoloc.localization.search import Proposal, Search, verify
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
@@ -48,8 +50,17 @@ def propose_more(search: Search) -> Iterator[Proposal]:
             yield from propose_unclear(search)
     if search.is_clear:
         yield from propose_similar_places(search)
-    yield from propose_repetitions(search)
+    yield from propose_rivals(search)
     yield from propose_virtual_views(search)
+    if search.is_last:
+        yield from propose_last(search)
+        yield from propose_rivals(search)
+
+
+def propose_rivals(search: Search) -> Iterator[Proposal]:
+    """Generate the poses from which other places look as from the best one."""
+    yield from propose_twins(search)
+    yield from propose_repetitions(search)
 
 
 @dataclass(eq=False)

@@ -30,7 +30,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from topoloc.features.matching import Matcher, largest_similarities
 from topoloc.geometry.camera import Camera
@@ -141,16 +141,36 @@ def match_and_fit(
 def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
     """Propose a pose in each place with many votes, most votes first.
 
-    They are not counted if the retrieved nodes agree by chance only, to refuse quickly.
+    They are not counted if the retrieved nodes agree by chance only.
     """
-    least, config = float(search.config.num_chance_inliers), search.config
-    if search.num_retrieved < least:
-        return
+    if search.num_retrieved >= search.config.num_chance_inliers:
+        yield from _propose_by_votes(search)
+
+
+def propose_last(search: Search) -> Iterator[NodeProposal]:
+    """Propose poses as `propose_voted_places` does if retrieval, virtual views and all before them
+    left no probable pose: an image that looks aside shares a small part with the nodes of its
+    place, which rank low."""
+    best, least = search.best, search.config.evidence.min_probability
+    is_open = best is None or best.probability < least
+    if is_open and search.num_retrieved < search.config.num_chance_inliers:
+        yield from _propose_by_votes(search)
+
+
+def _propose_by_votes(search: Search) -> Iterator[NodeProposal]:
     with search.query.clock.stage("coarse"):
         places = list(find_places(search))
+    yield from propose_places(search, "votes", places)
+
+
+def propose_places(
+    search: Search, source: Source, places: list[list[Row]]
+) -> Iterator[NodeProposal]:
+    """Propose a pose from the nodes of each place, if more agree than by chance."""
+    config, least = search.config, float(search.config.num_chance_inliers)
     for rows in places:
         matcher = create_matcher(search, rows)
-        proposal = match_and_fit(search, "votes", matcher, least, config.num_first_features)
+        proposal = match_and_fit(search, source, matcher, least, config.num_first_features)
         if proposal.fit.num_inliers >= least:
             yield proposal
 
@@ -165,10 +185,16 @@ def find_places(search: Search) -> Iterator[list[Row]]:
         if of_places.max(initial=0.0) < least or least == 0.0:
             return
         here = apart[int(np.argmax(of_places))] <= 1.0
-        order = np.argsort(-np.where(here, of_nodes, -1.0), kind="stable")
-        num_nodes = min(search.config.num_candidates + 1, int(here.sum()))
-        yield [rows[k] for k in order[:num_nodes]]
+        yield select_nodes(search, rows, np.where(here, of_nodes, -1.0), int(here.sum()))
         of_places[here] = 0.0
+
+
+def select_nodes(
+    search: Search, rows: list[Row], scores: Float[np.ndarray, " nodes"], max_nodes: int
+) -> list[Row]:
+    """Return the nodes with the largest scores, as many as are pooled, at most `max_nodes`."""
+    order = np.argsort(-scores, kind="stable")
+    return [rows[k] for k in order[: min(search.config.num_candidates + 1, max_nodes)]]
 
 
 def count_votes(
@@ -181,25 +207,39 @@ def count_votes(
 ]:
     """Return the nodes, how far apart they are, the votes of the place around each node, and of
     features that each node shows itself."""
-    max_nodes = 128  # of a larger map, the nodes that rank first
     max_lag = 0.02  # similarity: a node this near to the nearest one shows the feature, too
-    num_features = 64
+    num_features = 128
     query = search.query
-    ranked = search.map.coarse.rank(query.image, query.features, max_nodes)
-    rows = list(dict.fromkeys(one.row for one in ranked))
-    points = dict(zip(rows, search.map.local_maps(rows), strict=True))
-    rows = [row for row in rows if len(points[row].descriptors)]
+    rows, apart = rank_places(search)
     if not rows or not len(query.features):
         return [], np.zeros((0, 0)), np.zeros(0), np.zeros(0)
-    apart = _distances_between(search, rows)
     strongest = query.features.descriptors[:num_features]
-    similarities = largest_similarities(strongest, [points[row].descriptors for row in rows])
+    similarities = similarities_to_nodes(search, rows, strongest)
     nearest, largest = similarities.argmax(axis=0), similarities.max(axis=0)
     elsewhere = np.where(apart[:, nearest] > 2.0, similarities, -1.0).max(axis=0)
     # where no node is elsewhere, a feature leads over none
     leads = np.where(elsewhere > -1.0, np.maximum(largest - elsewhere, 0.0), 0.0)
     of_places = (apart <= 1.0) @ np.bincount(nearest, leads, len(rows))
     return rows, apart, of_places, (similarities >= largest - max_lag) @ leads
+
+
+def rank_places(search: Search) -> tuple[list[Row], Float[np.ndarray, "nodes nodes"]]:
+    """Return the nodes that rank first and have points, and how far apart they are."""
+    max_nodes = 128
+    query = search.query
+    ranked = search.map.coarse.rank(query.image, query.features, max_nodes)
+    rows = list(dict.fromkeys(one.row for one in ranked))
+    points = zip(rows, search.map.local_maps(rows), strict=True)
+    rows = [row for row, one in points if len(one.descriptors)]
+    return rows, _distances_between(search, rows)
+
+
+def similarities_to_nodes(
+    search: Search, rows: list[Row], descriptors: Float32[np.ndarray, "n d"]
+) -> Float[np.ndarray, "nodes n"]:
+    """Return the similarity of descriptors to the most similar point of each node."""
+    points = search.map.local_maps(rows)
+    return largest_similarities(descriptors, [one.descriptors for one in points])
 
 
 def _distances_between(search: Search, rows: list[Row]) -> Float[np.ndarray, "nodes nodes"]:
@@ -340,7 +380,7 @@ def propose_repetitions(search: Search) -> Iterator[NodeProposal]:
                 continue
             if num_asked == config.max_repetitions:
                 return
-            num_asked, search.is_repetitive = num_asked + 1, True
+            num_asked += 1
             tried.append(world_from_cam)
             least = 0.2 * hypothesis.evidence.num_found  # far fewer points refute a repetition
             previous, camera = search.belief.hypotheses, hypothesis.fit.camera

@@ -101,7 +101,8 @@ def refine(proposal: NodeProposal) -> PointMatches:
     search, first = proposal.search, proposal.fit
     final = refit_around(search, first)
     is_clear = first.num_inliers >= search.config.num_clear_inliers
-    if isinstance(first, PoseFit) and is_clear and final.num_inliers < first.num_inliers:
+    is_by_chance = first.num_inliers < search.config.num_chance_inliers
+    if isinstance(first, PoseFit) and not is_by_chance and final.num_inliers < first.num_inliers:
         # Around a bend the nearest nodes see another place than the image and the nodes it matched.
         final = max(final, _refit_with_own_nodes(search, first), key=lambda fit: fit.num_inliers)
     if not is_clear:  # a poor first pose may need a second round to find all points
@@ -151,7 +152,7 @@ def fit_around(
     with query.clock.stage("matching"):
         guided = replace(config.guided, radius_px=radius_px)
         if rows is None:
-            rows = search.map.nearest(cam_from_world.inverse(), guided.num_nodes)
+            rows = search.map.showing(cam_from_world, camera, guided.num_nodes)
         local_map = search.map.local_map(rows)
         matches = match_guided(query.features, local_map, *start, guided)
     matched = query.features, query.input_camera, local_map, matches

@@ -125,8 +125,6 @@ class Search:
     """The number of inliers of the fit to the retrieved candidates."""
     first: PointMatches | None = None
     """The first fit tried. It gives the reason if there is no hypothesis."""
-    is_repetitive: bool = False
-    """True if the best pose is one of many from which a repetitive place looks the same."""
     is_stopped: bool = False
     """True if the time limit was reached before all proposals were tried."""
 

@@ -71,7 +71,7 @@ def test_the_reverse_direction_is_localized_by_virtual_views():
     answered = [
         is_right(result, truth) for result, truth in answers if isinstance(result, Localization)
     ]
-    assert len(answered) < 0.5 * len(answers)  # localized by node viewpoints
+    assert len(answered) < len(answers)  # by nodes that show a part of the view
     assert all(answered)
 
 

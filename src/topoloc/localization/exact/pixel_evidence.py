@@ -21,7 +21,7 @@ from msgspec import Struct
 from topoloc.errors import FeatureTypeError
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.answer import Answer, Finding, lead
-from topoloc.localization.belief import Belief, Hypothesis
+from topoloc.localization.belief import Belief, Hypothesis, agree_on_pose
 from topoloc.localization.exact.appearance import (
     compare_colours,
     load_appearance_weights,
@@ -140,12 +140,13 @@ def measure_pixels(search: Search, hypothesis: Hypothesis) -> PixelAgreement | N
     there, elsewhere = (
         correlate(grey, one, weights.reach_px, last_step)[1] for one in (patches, moved)
     )
-    has_texture = np.isfinite(there)
-    if np.count_nonzero(has_texture) < weights.min_points:
-        return None
     rays = points - templates.origins, points - world_from_cam.translation
     lengths = np.prod([np.linalg.norm(one, axis=1) for one in rays], axis=0)
     angles = np.arccos(np.clip(np.sum(rays[0] * rays[1], axis=1) / lengths, -1.0, 1.0))
+    there[angles > math.pi / 2.0] = np.nan  # a node's surface is not seen from behind
+    has_texture = np.isfinite(there)
+    if np.count_nonzero(has_texture) < weights.min_points:
+        return None
     found, by_chance = (
         np.count_nonzero(one > weights.min_correlation) / max(np.count_nonzero(np.isfinite(one)), 1)
         for one in (there, elsewhere)
@@ -176,10 +177,8 @@ def weigh_pixels(query: MapQuery, answer: Answer) -> Finding | None:
     if not looked:
         return None
     found, text = max(looked, key=lambda one: one[0].pose.probability if one[0].pose else 0.0)
-    poses = [one.pose.world_from_cam for one, _ in looked if one.pose is not None]
-    config = first.config.evidence
-    max_rotation = 2.0 * math.radians(config.max_rotation_deg)
-    if not all(poses[0].is_same(one, 2.0 * config.max_translation, max_rotation) for one in poses):
+    leading = [one.best for one, _ in looked if one.pose is not None and one.best is not None]
+    if not all(agree_on_pose(leading[0], one, first.config.evidence) for one in leading):
         return Finding("pixels", f"{text}, but feature types disagree")
     return Finding("pixels", text, answer=found if found.pose or pose else None)
 
@@ -197,7 +196,9 @@ def _weigh(search: Search) -> tuple[Answer, str] | None:
             looked.append((one, gain, agreement.explain(one.log_odds, gain)))
     if not looked:
         return None
-    gains = {id(one): gain for one, gain in _keep_apart([(one, gain) for one, gain, _ in looked])}
+    measured = {id(one): gain for one, gain, _ in looked}
+    rivals = [(one, measured.get(id(one), 0.0)) for one in search.belief.of_nodes]
+    gains = {id(one): gain for one, gain in _keep_apart(rivals)}
     belief = Belief()
     for one in search.belief.hypotheses:
         weighed = replace(one, log_odds=one.log_odds + gains.get(id(one), 0.0))
@@ -208,7 +209,7 @@ def _weigh(search: Search) -> tuple[Answer, str] | None:
 
 def _keep_apart(looked: Sequence[tuple[Hypothesis, float]]) -> list[tuple[Hypothesis, float]]:
     """Return the gains. Poses that all pass get the least one, for pixels do not tell them
-    apart."""
+    apart. That of a pose that shows too few points is 0."""
     passing = [gain for one, gain in looked if one.log_odds + gain > 0.0]
     least = min(passing, default=0.0)
     return [(one, least if one.log_odds + gain > 0.0 else gain) for one, gain in looked]

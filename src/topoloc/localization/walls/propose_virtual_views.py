@@ -221,7 +221,6 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     )
     if (
         is_explained_by_nodes
-        or search.is_repetitive
         or config.num_places == 0
         or isinstance(search.query.input_camera, UncalibratedCamera)
         or (index := search.map.walls) is None
