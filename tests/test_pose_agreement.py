@@ -19,6 +19,7 @@ OTHER_TESTS = {
 OTHER_ENGINES = {
     "apps/georeferencing/georeference_fit.py:_robust_weights",
     "tracking/gyroscope.py:find_start",  # it calls find_least_median
+    "apps/reconstruction/gnss.py:_fit_robustly",  # a similarity, by least median of squares
     "apps/cli/maps/floor.py:_sample_normal",  # it searches a plane, no transform
 }
 _ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)

@@ -36,6 +36,8 @@ export interface Query {
   num_matches: number;
   num_inliers: number;
   times_ms: Record<string, number>;
+  /** The map has no scale: lengths are in its units. */
+  scale?: "none";
   /** Streams only, as the next three. */
   /** Probability that the colours in view are this floor's and not another's, if both were as likely. */
   appearance?: number;
@@ -51,6 +53,8 @@ export interface Localized extends Query {
   /** 6x6, left perturbation (translation, rotation) of world_from_cam. */
   covariance: number[][];
   position_sigma_m: number;
+  /** Instead of position_sigma_m, in a map without scale. */
+  position_sigma?: number;
   rotation_sigma_deg: number;
   probability: number;
   calibrated?: false;

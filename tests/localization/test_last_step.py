@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
@@ -77,29 +76,6 @@ def test_a_pose_that_cannot_be_aligned_keeps_the_shared_errors_of_its_first_one(
     shared = (1.0 - first.noise_share) * first.covariance
     assert np.linalg.eigvalsh(found.covariance - shared)[0] > -1e-12
     assert aligned.position_sigma_m < found.position_sigma_m
-
-
-def test_a_refined_pose_that_contradicts_the_first_one_is_not_used(
-    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
-):
-    refine = last_step.refine_precisely
-    aside = Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0]))
-
-    def refine_to_the_side(*given: Any) -> last_step.PreciseFit | None:
-        fit = refine(*given)
-        assert fit is not None
-        moved = replace(fit.pose, cam_from_world=aside @ fit.pose.cam_from_world)
-        return replace(fit, pose=moved)
-
-    best, fast = Localizer(room), Localizer(room, LocalizerConfig(exactness="fast"))
-    (image, _), trace = unseen_views(step=0.75)[0], Trace()
-    first = _localized(fast, image)
-    monkeypatch.setattr(last_step, "refine_precisely", refine_to_the_side)
-    found = best.localize(image, CAMERA, trace=trace)
-    assert isinstance(found, Localization)
-    assert _error_mm(found, first.world_from_cam) == 0.0
-    np.testing.assert_array_equal(found.covariance, first.covariance)
-    assert any("contradicts" in one.text for one in trace.findings)
 
 
 def test_strong_distortion_is_part_of_the_warp(room: TopoMetricMap):

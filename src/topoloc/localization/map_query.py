@@ -23,7 +23,6 @@ from topoloc.localization.map_context import MapContext
 from topoloc.localization.propose import (
     propose_first,
     propose_from_other_features,
-    propose_last,
     propose_node_viewpoints,
     propose_repetitions,
     propose_similar_places,
@@ -44,16 +43,23 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
 
 
 def propose_more(search: Search) -> Iterator[Proposal]:
-    """Generate the proposals of one feature type that follow retrieval."""
-    for propose_unclear in (propose_voted_places, propose_node_viewpoints):
-        if not search.is_clear:
-            yield from propose_unclear(search)
+    """Generate the proposals of one feature type that follow retrieval.
+
+    If the retrieved nodes agree by chance only, votes are counted last, and only if no pose is
+    probable: an image that looks aside shares a small part with the nodes of its place.
+    """
+    is_by_chance = search.num_retrieved < search.config.num_chance_inliers
+    if not is_by_chance and not search.is_clear:
+        yield from propose_voted_places(search)
+    if not search.is_clear:
+        yield from propose_node_viewpoints(search)
     if search.is_clear:
         yield from propose_similar_places(search)
     yield from propose_rivals(search)
     yield from propose_virtual_views(search)
-    if search.is_last:
-        yield from propose_last(search)
+    best, least = search.best, search.config.evidence.min_probability
+    if search.is_last and is_by_chance and (best is None or best.probability < least):
+        yield from propose_voted_places(search)
         yield from propose_rivals(search)
 
 

@@ -139,25 +139,7 @@ def match_and_fit(
 
 
 def propose_voted_places(search: Search) -> Iterator[NodeProposal]:
-    """Propose a pose in each place with many votes, most votes first.
-
-    They are not counted if the retrieved nodes agree by chance only.
-    """
-    if search.num_retrieved >= search.config.num_chance_inliers:
-        yield from _propose_by_votes(search)
-
-
-def propose_last(search: Search) -> Iterator[NodeProposal]:
-    """Propose poses as `propose_voted_places` does if retrieval, virtual views and all before them
-    left no probable pose: an image that looks aside shares a small part with the nodes of its
-    place, which rank low."""
-    best, least = search.best, search.config.evidence.min_probability
-    is_open = best is None or best.probability < least
-    if is_open and search.num_retrieved < search.config.num_chance_inliers:
-        yield from _propose_by_votes(search)
-
-
-def _propose_by_votes(search: Search) -> Iterator[NodeProposal]:
+    """Propose a pose in each place with many votes, most votes first."""
     with search.query.clock.stage("coarse"):
         places = list(find_places(search))
     yield from propose_places(search, "votes", places)

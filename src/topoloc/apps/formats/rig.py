@@ -254,7 +254,9 @@ class Instants(IndexedFrames):
 
 def is_rig(path: str) -> bool:
     """Return whether a path, perhaps with a selection, is a folder with rig.json."""
-    return (split_selection(path)[0] / "rig.json").is_file()
+    return os.path.isfile(
+        split_selection(path)[0] / "rig.json"
+    )  # False for paths that are too long
 
 
 def open_instants(path: str, rig_file: str | None = None) -> StereoSequence:

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import (
     AbsolutePose,
@@ -34,11 +33,7 @@ from topoloc.localization.exact.patch_alignment import (
 from topoloc.localization.guided import match_guided
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.pose_fit import LocalMap
-from topoloc.localization.result import Localization
 from topoloc.localization.search import Search
-
-_CHI_SQUARE_6 = 33.1
-"""Quantile of chi-square with six degrees of freedom that one of 100,000 exceeds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +66,7 @@ def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
     """Refine the pose of an answer with all nodes around it, unless too few points agree.
 
     Nodes near a pose from virtual views show something else. A calibration in doubt and a rotation
-    during a rolling shutter would have to be estimated with the pose. A refined pose that
-    contradicts the one it began with is not used: in small parts of an image nodes differ.
+    during a rolling shutter would have to be estimated with the pose.
     """
     pose, best, searches = answer.pose, answer.best, query.searches
     weights = load_last_step_weights()
@@ -92,40 +86,26 @@ def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
         fit = refine_precisely(ordered, pose.world_from_cam.inverse(), weights)
         if fit is None:
             return None
-        seen, covariance, noise_share = _measure_errors(first, fit, pose, weights)
-    world_from_cam, both = fit.pose.cam_from_world.inverse(), pose.covariance + covariance
-    if not pose.world_from_cam.is_same(world_from_cam, covariance=both, max_square=_CHI_SQUARE_6):
-        return Finding("exact pose", "not used, for it contradicts the pose that it began with")
-    facts = {
-        "world_from_cam": world_from_cam,
-        "covariance": covariance,
-        "noise_share": noise_share,
-    }
-    points, text = seen.to_image_scale(first.query.scale), f"refined with {len(seen)} points"
-    return Finding("exact pose", text, facts=facts, points=points)
-
-
-def _measure_errors(
-    search: Search, fit: PreciseFit, pose: Localization, weights: LastStepWeights
-) -> tuple[PreciseMatches, Float[np.ndarray, "6 6"], float]:
-    """Return the inliers of a fit, the covariance of its pose, and the share that is noise."""
-    seen, cam_from_world = (
-        fit.matches.select(np.flatnonzero(fit.pose.inliers)),
-        fit.pose.cam_from_world,
-    )
-    parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
-    inflation = compute_variance_inflation(
-        *parts, search.query.camera, cam_from_world, seen.sigmas_px
-    )
+        seen = fit.matches.select(np.flatnonzero(fit.pose.inliers))
+        parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
+        cam_from_world = fit.pose.cam_from_world
+        inflation = compute_variance_inflation(
+            *parts, first.query.camera, cam_from_world, seen.sigmas_px
+        )
     noise = inflation**2 * fit.pose.covariance
     before = inverse_covariance(pose.world_from_cam, pose.covariance)
     shared = (1.0 - pose.noise_share) * before  # key points share the errors of the verdict's
     if fit.is_aligned:
         # the less the nodes contradict each other, the more of their errors average out
-        shared *= min(1.0, weights.shared_error_slope * search.correlated_error_share)
+        shared *= min(1.0, weights.shared_error_slope * first.correlated_error_share)
         shared += np.dot(weights.slow_errors, (1.0, 1.0 / len(seen))) * noise
-    noise_share = float(np.trace(noise[:3, :3]) / np.trace((noise + shared)[:3, :3]))
-    return seen, inverse_covariance(cam_from_world, noise + shared), noise_share
+    facts = {
+        "world_from_cam": cam_from_world.inverse(),
+        "covariance": inverse_covariance(cam_from_world, noise + shared),
+        "noise_share": float(np.trace(noise[:3, :3]) / np.trace((noise + shared)[:3, :3])),
+    }
+    points, text = seen.to_image_scale(first.query.scale), f"refined with {len(seen)} points"
+    return Finding("exact pose", text, facts=facts, points=points)
 
 
 def refine_precisely(
@@ -181,8 +161,7 @@ class Surroundings:
         searches: Sequence[Search], cam_from_world: Rigid3, weights: LastStepWeights
     ) -> Surroundings:
         """Return the surroundings of a pose."""
-        camera = searches[0].query.camera
-        rows = searches[0].map.showing(cam_from_world, camera, weights.num_nodes)
+        rows = searches[0].map.nearest(cam_from_world.inverse(), weights.num_nodes)
         return Surroundings(searches, [one.map.local_map(rows) for one in searches], weights)
 
     @property

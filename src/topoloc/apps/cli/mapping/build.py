@@ -81,11 +81,11 @@ class Command:
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(
             metavar="METRES|IMAGE_A,IMAGE_B=METRES|none",
-            help_behavior_hint="(distances: several times)",
+            help_behavior_hint="(repeatable)",
         ),
     ] = ()
     """Metres in a unit of the poses of models without a scale; or a measured distance between the
-    cameras of two images. `none`: photos make a map without scale (`topoloc scale` sets it)."""
+    cameras of two images. `none`: a map without scale (`topoloc scale`)."""
     tag: Annotated[float | None, option("METRES")] = None
     """Side of printed AprilTags or ArUco markers: the scale of photos."""
     topics: Topics = None
