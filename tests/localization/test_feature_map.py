@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from built_room import unseen_views
 from tiny_world import CAMERA, path_pose
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.guided import count_seen_points
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import NodePoses, node_distances, node_distances_for_any_roll
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -58,3 +61,22 @@ def test_a_view_aside_takes_nodes_that_show_it(room_map: Path):
         distances = opened.distances(aside)
         others = np.setdiff1d(np.flatnonzero(counts >= 0.5 * counts.max()), chosen)
         assert distances[chosen].max() <= distances[others].min()
+
+
+def test_shared_errors_grow_with_the_distance_from_all_nodes(
+    room_map: Path, monkeypatch: pytest.MonkeyPatch
+):
+    image, truth = unseen_views()[0]
+    sigmas = list[float]()
+    with TopoMetricMap.load(room_map) as topomap:
+        opened = FeatureMap(topomap)
+        assert opened.remoteness(opened.node_poses.world_from_node(3)) == pytest.approx(0, abs=1e-6)
+        expected = opened.distances(truth).min() / (5.0 * opened.d_thresh)
+        assert opened.remoteness(truth) == pytest.approx(expected)
+        for remoteness in (0.2, 1.0, 4.0):
+            monkeypatch.setattr(FeatureMap, "remoteness", lambda *_, value=remoteness: value)
+            found = Localizer(topomap, LocalizerConfig(exactness="fast")).localize(image, CAMERA)
+            assert isinstance(found, Localization)
+            sigmas.append(found.position_sigma_m)
+    assert sigmas[0] == sigmas[1]
+    assert sigmas[2] > 1.01 * sigmas[1]

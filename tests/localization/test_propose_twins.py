@@ -11,9 +11,10 @@ from doubled_room import twice
 from tiny_world import CAMERA
 from topoloc.localization import map_query, propose_twins as twins
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import NotLocalized
-from topoloc.localization.search import Trace
+from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
 
 # pooled with its copy, a node's matches would fail the ratio test
@@ -30,7 +31,8 @@ def test_a_pose_far_from_all_nodes_is_compared_with_places_that_show_the_same(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, is_far: bool
 ):
     sources = set[str]()
-    monkeypatch.setattr(twins, "MIN_DISTANCE", 0.0 if is_far else 1e6)
+    monkeypatch.setattr(FeatureMap, "remoteness", lambda *_: 2.0 if is_far else 0.5)
+    monkeypatch.setattr(Search, "is_clear", False)  # similar places are searched for clear poses
     monkeypatch.setattr(map_query, "propose_more", twins.propose_twins)
     localizer, results = Localizer(twice(room), ONE_NODE), []
     for picture, _ in unseen_views():

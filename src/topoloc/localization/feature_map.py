@@ -231,6 +231,11 @@ class FeatureMap:
         distances[self._masked_rows] = np.inf
         return distances
 
+    def remoteness(self, world_from_cam: Rigid3) -> float:
+        """Return the distance to the nearest node by Eq. 1 over 5 D_thresh. Above 1 a camera is far
+        from all nodes: recorded frames are within 1 D_thresh of one."""
+        return float(self.distances(world_from_cam).min()) / (5.0 * self.d_thresh)
+
     def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> list[Row]:
         """Return the rows of the nodes nearest to a camera, nearest first."""
         order = np.argsort(self.distances(world_from_cam), kind="stable")
@@ -243,11 +248,11 @@ class FeatureMap:
         Beside the path the nearest nodes by Eq. 1 look past what the camera sees, and nodes farther
         back show it. Those count that show half as many points as the best one.
         """
-        max_num_d_thresh, max_read, min_share = 5.0, 24, 0.5
+        max_read, min_share = 24, 0.5
         world_from_cam = cam_from_world.inverse()
-        distances = self.distances(world_from_cam)
-        if distances.min() <= max_num_d_thresh * self.d_thresh:
+        if self.remoteness(world_from_cam) <= 1.0:
             return self.nearest(world_from_cam, num_nodes)
+        distances = self.distances(world_from_cam)
         centres = self.node_poses.centres
         apart = np.linalg.norm(centres - world_from_cam.translation, axis=1)
         apart[np.isinf(distances)] = np.inf

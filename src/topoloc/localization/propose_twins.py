@@ -22,18 +22,14 @@ from topoloc.localization.refine import NodeProposal
 from topoloc.localization.search import Search
 from topoloc.node_ids import Row
 
-MIN_DISTANCE = 5.0
-"""Least distance (D_thresh, Eq. 1) of a pose to all nodes. Recorded frames are a few from one."""
-
 
 def propose_twins(search: Search) -> Iterator[NodeProposal]:
-    """Propose poses in other places that show the inliers of the best pose, if it is far from all
-    nodes."""
+    """Propose poses in other places that show the inliers of the best pose, if it is not clear and
+    far from all nodes."""
     of_nodes = search.belief.of_nodes
-    if not of_nodes or search.is_hopeless:
+    if not of_nodes or search.is_clear or search.is_hopeless:
         return
-    nearest = search.map.distances(of_nodes[0].world_from_cam).min()
-    if nearest > MIN_DISTANCE * search.map.d_thresh:
+    if search.map.remoteness(of_nodes[0].world_from_cam) > 1.0:
         with search.query.clock.stage("coarse"):
             places = list(_find_twins(search, of_nodes[0]))
         yield from propose_places(search, "look-alikes", places)

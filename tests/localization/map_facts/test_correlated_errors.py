@@ -14,7 +14,7 @@ from built_room import built_room
 from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.answer import growth_with_distance, shape_as_motion
+from topoloc.localization.answer import shape_as_motion
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -160,12 +160,6 @@ def test_shared_errors_are_motions_and_keep_their_mean_square_in_sigmas_of_the_n
     np.testing.assert_allclose(metres, depth * radians)
     factor = 3.0  # of the worse nodes
     assert np.trace(np.linalg.solve(noise, shared)) == pytest.approx(factor * 6.0 * 50.0)
-
-
-def test_shared_errors_grow_with_the_distance_to_the_nearest_node():
-    assert growth_with_distance(0.4, d_thresh=0.1) == 1.0
-    assert growth_with_distance(2.0, d_thresh=0.1) == pytest.approx(4.0)
-    assert growth_with_distance(2.0, d_thresh=0.2) == pytest.approx(2.0)
 
 
 def test_the_first_query_computes_nothing_of_the_map(
