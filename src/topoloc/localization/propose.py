@@ -190,7 +190,7 @@ def count_votes(
     """Return the nodes, how far apart they are, the votes of the place around each node, and of
     features that each node shows itself."""
     max_lag = 0.02  # similarity: a node this near to the nearest one shows the feature, too
-    num_features = 128
+    num_features = 64
     query = search.query
     rows, apart = rank_places(search)
     if not rows or not len(query.features):
