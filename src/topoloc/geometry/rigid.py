@@ -7,6 +7,7 @@ the left: ``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
@@ -265,6 +266,12 @@ class _PoseJson(Struct, frozen=True):
 def positions_of(world_from_cams: Iterable[Rigid3]) -> Float[np.ndarray, "n 3"]:
     """Return the translations of poses, one row each."""
     return np.array([pose.translation for pose in world_from_cams], dtype=np.float64).reshape(-1, 3)
+
+
+def standard_deviations(covariance: Float[np.ndarray, "6 6"]) -> tuple[float, float]:
+    """Return the root mean square errors of position (metres) and rotation (radians) by the
+    covariance of a pose."""
+    return math.sqrt(np.trace(covariance[:3, :3])), math.sqrt(np.trace(covariance[3:, 3:]))
 
 
 def inverse_covariance(

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from topoloc.features.features import Matches
 from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, standard_deviations
 from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.guided import count_chance_matches, select_visible_points
@@ -73,9 +73,7 @@ def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceCo
     precision alone refuses no pose: rho is that of the worse parts of a map.
     """
     max_translation, max_rotation_deg = config.max_errors
-    metres, radians = (
-        math.sqrt(np.trace(part)) for part in (covariance[:3, :3], covariance[3:, 3:])
-    )
+    metres, radians = standard_deviations(covariance)
     doubt = max(metres / max_translation, math.degrees(radians) / max_rotation_deg)
     return max(probability_within_tolerance(doubt), config.min_probability)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Literal, TypeVar
@@ -14,7 +15,7 @@ from msgspec import Meta, Struct, structs
 from topoloc.errors import ResultError
 from topoloc.geometry.calibration_check import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.geodesy import GeoPose
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, standard_deviations
 from topoloc.json_data import Count, Finite, NonNegative, OneLine, decode_json
 from topoloc.localization.provenance import EMPTY_PROVENANCE, Evidence, Provenance
 from topoloc.node_ids import NodeId
@@ -138,7 +139,7 @@ class Localization(_Result):
     def position_sigma_m(self) -> float:
         """Return the root mean square position error by `camera_covariance`, metres, or units
         of a map without scale."""
-        return float(np.sqrt(np.trace(self.camera_covariance[:3, :3])))
+        return standard_deviations(self.camera_covariance)[0]
 
     @property
     def position_sigma_text(self) -> str:
@@ -149,7 +150,7 @@ class Localization(_Result):
     @property
     def rotation_sigma_deg(self) -> float:
         """Return the root mean square rotation error (degrees) by `camera_covariance`."""
-        return float(np.rad2deg(np.sqrt(np.trace(self.camera_covariance[3:, 3:]))))
+        return math.degrees(standard_deviations(self.camera_covariance)[1])
 
     @property
     def camera_covariance(self) -> Float[np.ndarray, "6 6"]:

@@ -6,13 +6,14 @@ the other. Most instants must agree.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, standard_deviations
 from topoloc.geometry.transform_consensus import TransformConsensus, find_consensus
 from topoloc.localization.result import Localization
 
@@ -31,12 +32,12 @@ class Mounting:
     @property
     def position_sigma_m(self) -> float:
         """Return the root mean square position error by `covariance`."""
-        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+        return standard_deviations(self.covariance)[0]
 
     @property
     def rotation_sigma_deg(self) -> float:
         """Return the root mean square rotation error by `covariance`."""
-        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
+        return math.degrees(standard_deviations(self.covariance)[1])
 
 
 def find_mountings(

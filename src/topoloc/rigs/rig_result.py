@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, standard_deviations
 from topoloc.json_data import OneLine
 from topoloc.localization.result import Localization, NotLocalized, Reason
 
@@ -47,12 +48,12 @@ class RigLocalization(OneLine):
     @property
     def position_sigma_m(self) -> float:
         """Return the root mean square position error (metres) by `covariance`."""
-        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+        return standard_deviations(self.covariance)[0]
 
     @property
     def rotation_sigma_deg(self) -> float:
         """Return the root mean square rotation error (degrees) by `covariance`."""
-        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
+        return math.degrees(standard_deviations(self.covariance)[1])
 
     def to_json(self, query: str = "") -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""
