@@ -35,9 +35,13 @@ class RigLocalizer:
     chooses nodes only; a camera's pose needs the same evidence as without. If no camera confirms
     that pose, the others are searched without it, so that cameras that contradict each other are
     found.
+
+    Raises MapError: the map has no scale, but mountings are in metres.
     """
 
     def __init__(self, localizer: Localizer, rig: Rig) -> None:
+        if "" in localizer.tile_ids:  # a map; tiles of an atlas have a scale
+            localizer.topomap.require_scale("a rig")
         self.localizer, self.rig = localizer, rig
 
     def localize(

@@ -12,6 +12,7 @@ import pytest
 import photographed_room as room
 import tiny_world
 from topoloc.apps.cli import main
+from topoloc.errors import MapError
 from topoloc.geometry.geodesy import GeoPoint
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.merge import rescale_map
@@ -22,6 +23,8 @@ from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import MemorySequence, StereoFrame
+from topoloc.rigs.rig import Rig, RigCamera
+from topoloc.rigs.rig_localizer import RigLocalizer
 
 UNIT = 0.5  # metres
 
@@ -157,3 +160,10 @@ def test_what_gives_no_scale(
     assert main(["scale", str(target), *options]) != 0
     assert said in capsys.readouterr().err
     assert target.read_bytes() == before
+
+
+def test_a_rig_needs_metres(target: Path):
+    with TopoMetricMap.load(target) as topomap:
+        rig = Rig({"ahead": RigCamera(Rigid3.identity(), tiny_world.CAMERA)})
+        with pytest.raises(MapError, match=r"a rig needs metres: set it by `topoloc scale"):
+            RigLocalizer(Localizer(topomap), rig)

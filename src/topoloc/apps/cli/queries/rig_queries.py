@@ -64,8 +64,6 @@ def localize_rigs(
         UsageError: there is no input.
         QueryError: an image has another size than its camera.
     """
-    if len(localizer.tile_ids) == 1:
-        localizer.topomap.require_scale("a rig")
     if not paths:
         raise UsageError("--rig takes folders with one recording for each camera, or panoramas")
     walks = [open_instants(path, rig_file) for path in paths]
