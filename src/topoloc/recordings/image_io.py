@@ -75,6 +75,7 @@ def read_image(
     as_stored: bool = False,
     white: int | None = None,
     max_pixels: int = MAX_PIXELS,
+    max_size: tuple[int, int] | None = None,
 ) -> Image:
     """Read an image as grey (H, W) or RGB (H, W, 3), uint8. Alpha is dropped. `as_stored` ignores
     the EXIF orientation. 16 bits are scaled to 8, so that `white` becomes 255. By default it is
@@ -83,9 +84,13 @@ def read_image(
 
     Raises:
         UnreadableImageError: the file is missing, empty, truncated, damaged, not an image, or
-            larger than 100 megapixels.
+            larger than 100 megapixels or than `max_size` (width, height).
     """
     with open_image(path) as picture:
+        width, height = picture.size
+        if max_size and (width > max_size[0] or height > max_size[1]):
+            most = f"{max_size[0]}x{max_size[1]}"
+            raise UnreadableImageError(f"{path} is {width}x{height}, more than {most}")
         if picture.format == "WEBP" and (as_stored or _orientation(picture) == 1):
             return _decode_webp(path, _reduction(picture, max_pixels))
     with _decode_image(path, as_stored, max_pixels) as picture:

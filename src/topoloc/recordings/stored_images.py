@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from topoloc.errors import MapError, UnreadableImageError
 from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import EncodedImage, image_size, read_image
+from topoloc.recordings.image_io import EncodedImage, read_image
 
 
 def encode_jpeg(image: Image, quality: int) -> bytes:
@@ -33,13 +33,8 @@ def read_stored_image(owner: str, data: bytes, max_size: tuple[int, int]) -> Ima
     Raises:
         MapError: the image is damaged or larger. The message names its owner.
     """
-    encoded = EncodedImage("its image", data)
     with MapError.at(f"{owner} is damaged", UnreadableImageError):
-        width, height = image_size(encoded)
-        if width > max_size[0] or height > max_size[1]:
-            fault = f"its image is {width}x{height}, more than {max_size[0]}x{max_size[1]}"
-            raise MapError(f"{owner} is damaged: {fault}")
-        return read_image(encoded)
+        return read_image(EncodedImage("its image", data), as_stored=True, max_size=max_size)
 
 
 def decode_stored_image(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"]:
