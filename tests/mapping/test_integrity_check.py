@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import ExifTags
 from PIL import Image as Pillow
 
 from built_room import built_room
@@ -88,3 +89,14 @@ def test_an_image_larger_than_its_camera_is_damage_of_its_node(saved: Path, kind
     assert find_map_damage(saved) == [fault]
     with TopoMetricMap.load(saved) as damaged, pytest.raises(MapError, match=fault):
         create_document(damaged, "large")
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def test_a_stored_image_is_never_turned_beyond_the_size_of_its_camera(saved: Path, kind: str):
+    exif, file = Pillow.Exif(), io.BytesIO()
+    exif[ExifTags.Base.Orientation] = 6  # a quarter turn
+    Pillow.new("L", (320, 240)).save(file, kind, exif=exif)
+    node = replace(TopoMetricMap.load(saved).nodes[0], template_image=file.getvalue())
+    image = node.read_image()
+    assert image is not None
+    assert image.shape[:2] == (240, 320)

@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32
 
-from topoloc.compiled import parallel_for_rows
 from topoloc.errors import EmptyMapError
 from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
@@ -138,14 +137,7 @@ class FeatureMap:
 
     def templates(self, node_ids: Iterable[NodeId]) -> list[NodeTemplate]:
         """Return the images of these nodes."""
-        rows = self.topomap.rows_of(node_ids)
-        found: list[NodeTemplate | None] = [None] * len(rows)
-
-        def decode(first: int, last: int) -> None:
-            found[first:last] = self._template.pool(rows[first:last])
-
-        parallel_for_rows(decode, len(rows))  # a decoder keeps one core busy
-        return [one for one in found if one is not None]
+        return self._template.pool(self.topomap.rows_of(node_ids))
 
     def predict_at_nodes(
         self, rows: Sequence[Row], camera: Camera
