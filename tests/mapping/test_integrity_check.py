@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags
-from PIL import Image as Pillow
+from PIL import ExifTags, Image as Pillow
 
 from built_room import built_room
 from topoloc.apps.cli import main
