@@ -16,7 +16,7 @@ from topoloc.apps.cli import main
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact.appearance import SWAP_RED_AND_BLUE
-from topoloc.localization.exact.patch_alignment import small_colours
+from topoloc.localization.exact.templates import small_colours
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization, NotLocalized

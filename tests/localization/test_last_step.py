@@ -17,13 +17,12 @@ from tiny_world import CAMERA
 from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.exact import last_step, patch_alignment
+from topoloc.localization.exact import last_step
 from topoloc.localization.exact.patch_alignment import (
-    NodeTemplate,
-    PointTemplates,
     align_patches,
     load_last_step_weights,
 )
+from topoloc.localization.exact.templates import NodeTemplate, PointTemplates
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Trace
@@ -95,10 +94,10 @@ def test_without_images_of_the_nodes_a_pose_is_found_all_the_same(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     image, truth = unseen_views()[2]
-    read = patch_alignment.NodeTemplate.of_node
+    read = NodeTemplate.of_node
     for damaged in (b"", b"no image"):
         monkeypatch.setattr(
-            patch_alignment.NodeTemplate,
+            NodeTemplate,
             "of_node",
             staticmethod(lambda node, jpeg=damaged: read(replace(node, template_image=jpeg))),
         )

@@ -18,7 +18,7 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.exact.patch_alignment import NodeTemplate
+from topoloc.localization.exact.templates import NodeTemplate
 from topoloc.localization.guided import count_seen_points, predict_key_points
 from topoloc.localization.map_facts.repetition import (
     NUM_NEIGHBOURS,

@@ -13,7 +13,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.exact.patch_alignment import PointTemplates
+from topoloc.localization.exact.templates import PointTemplates
 from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.pose_fit import PointMatches, PoseFit

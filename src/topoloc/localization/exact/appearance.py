@@ -24,7 +24,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Finite, decode_json
 from topoloc.localization.answer import Answer, Finding
 from topoloc.localization.evidence import sample_rows
-from topoloc.localization.exact.patch_alignment import sample_colours, small_colours
+from topoloc.localization.exact.templates import sample_colours, small_colours
 from topoloc.localization.guided import select_visible_points
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.search import Search

@@ -6,24 +6,21 @@ query image. This is adaptive least-squares correlation (Gruen, 1985) with a shi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from msgspec import Struct
 
 from topoloc.compiled import kernel, parallel_for_rows
-from topoloc.errors import FeatureTypeError, MapError
+from topoloc.errors import FeatureTypeError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Finite, decode_json
+from topoloc.localization.exact.templates import PointTemplates
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.mapping.topomap import TopoNode
-from topoloc.recordings.frame import Image, to_grey
 
 
 class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,95 +83,6 @@ class PreciseMatches(PointObservations):
     def select(self, rows: np.ndarray) -> PreciseMatches:
         """Return the given rows."""
         return PreciseMatches(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-
-@dataclass(frozen=True, eq=False)
-class NodeTemplate:
-    """Hold the image of a node. `camera` has the size of the image. An image that is missing or
-    damaged `is_black`. `colours` are its `small_colours`."""
-
-    image: UInt8[np.ndarray, "h w"]
-    camera: Camera
-    world_from_cam: Rigid3
-    is_black: bool = False
-    colours: Float[np.ndarray, "rows columns 3"] | None = None
-
-    @staticmethod
-    def of_node(node: TopoNode) -> NodeTemplate:
-        """Return the stored image of a node in grey."""
-        try:
-            image = node.read_image()
-        except MapError:
-            image = None
-        grey = np.zeros((2, 2), np.uint8) if image is None else to_grey(image)
-        camera = node.camera.rescaled(*grey.shape[::-1])
-        colours = None if image is None else small_colours(image)
-        return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None, colours)
-
-
-_COLOURS = np.array([[1.0, 1.0, 1.0], [3.0, -3.0, 0.0], [-1.5, -1.5, 3.0]]) / 3.0
-
-
-def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
-    """Return the logarithms of brightness, red over green and blue over yellow in 80 columns. None:
-    the image is grey."""
-    if image.ndim == 2:
-        return None
-    size = 80, max(1, round(80 * image.shape[0] / image.shape[1]))
-    darkest = 8.0  # levels below are noise
-    levels = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA) + np.float32(darkest))
-    return cv2.transform(levels, _COLOURS)
-
-
-def sample_colours(
-    colours: Float[np.ndarray, "rows columns 3"], places: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n 3"]:
-    """Return the colours at places, which are pixels over the image size."""
-    x, y = (places * colours.shape[1::-1] - 0.5).astype(np.float32).T[:, :, None]
-    sampled = cv2.remap(colours, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return sampled.reshape(-1, 3).astype(np.float64)
-
-
-@dataclass(frozen=True, eq=False)
-class PointTemplates:
-    """Hold the images of the nodes of points: that of point k is `templates[of_point[k]]`."""
-
-    templates: Sequence[NodeTemplate]
-    of_point: Int[np.ndarray, " n"]
-
-    @property
-    def rotations(self) -> Float[np.ndarray, "n 3 3"]:
-        """Return the rotation of world_from_cam of the node of each point."""
-        return np.array([one.world_from_cam.rotation for one in self.templates])[self.of_point]
-
-    @property
-    def origins(self) -> Float[np.ndarray, "n 3"]:
-        """Return the position (metres, world) of the node of each point."""
-        return np.array([one.world_from_cam.translation for one in self.templates])[self.of_point]
-
-    def in_nodes(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return points in the camera frames of their nodes, metres."""
-        return np.einsum("nji,nj->ni", self.rotations, points_world - self.origins)
-
-    def project(self, in_nodes: Float[np.ndarray, "k n 3"]) -> Float[np.ndarray, "k n 2"]:
-        """Return the pixels of k positions of each point, given in the frame of its node."""
-        pixels, cameras = np.empty((*in_nodes.shape[:2], 2)), [one.camera for one in self.templates]
-        for camera in set(cameras):
-            rows = np.flatnonzero(np.array([one == camera for one in cameras])[self.of_point])
-            projected = camera.img_from_cam(in_nodes[:, rows].reshape(-1, 3))
-            pixels[:, rows] = projected.reshape(-1, len(rows), 2)
-        return pixels
-
-    def sample_colours(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return the `small_colours` of points in the images of their nodes, NaN where grey."""
-        pixels = self.project(self.in_nodes(points_world)[None])[0]
-        colours = np.full(points_world.shape, np.nan)
-        for k, template in enumerate(self.templates):
-            rows = np.flatnonzero(self.of_point == k)
-            if template.colours is not None:
-                size = [template.camera.width, template.camera.height]
-                colours[rows] = sample_colours(template.colours, pixels[rows] / size)
-        return colours
 
 
 def align(
@@ -246,10 +154,7 @@ def correlate(
     """Return the pixels where patches correlate best with an image, and the correlations as
     `align_patches` does."""
     templates, count = patches.templates, len(patches.predicted)
-    sizes = np.array([one.image.shape for one in templates.templates]).reshape(-1, 2)
-    images = np.zeros((len(sizes), *sizes.max(axis=0, initial=1)), np.uint8)
-    for k, template in enumerate(templates.templates):
-        images[k, : sizes[k, 0], : sizes[k, 1]] = template.image
+    images, sizes = templates.images
     pixels, correlations = np.empty((count, 2)), np.empty(count)
 
     def align_band(first: int, last: int) -> None:
@@ -266,66 +171,74 @@ def correlate(
 # Numba kernels
 
 
-@kernel(fastmath={"reassoc", "contract"})
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"})
 def _sample_patch(template, size, x, y, warp, patch):
     """Write the template around (x, y), warped to the query, into `patch`, with zero mean. Return
     the sum of its squares, 0 if it leaves the template."""
     side = len(patch)
-    half = side // 2
-    height, width = size[0], size[1]
-    total, squares, one = np.float32(0.0), np.float32(0.0), np.float32(1.0)
+    half, mean, squares, one = side // 2, np.float32(0.0), np.float32(0.0), np.float32(1.0)
+    reach_x = half * (abs(warp[0, 0]) + abs(warp[0, 1]))
+    reach_y = half * (abs(warp[1, 0]) + abs(warp[1, 1]))
+    height, width = size[0] - 1.001, size[1] - 1.001  # what rounding adds stays inside
+    if not (reach_x <= x <= width - reach_x and reach_y <= y <= height - reach_y):
+        return squares
     for j in range(side):
         for i in range(side):
             px = x + warp[0, 0] * (i - half) + warp[0, 1] * (j - half)
             py = y + warp[1, 0] * (i - half) + warp[1, 1] * (j - half)
-            x0, y0 = int(np.floor(px)), int(np.floor(py))
-            if x0 < 0 or y0 < 0 or x0 + 1 >= width or y0 + 1 >= height:
-                return np.float32(0.0)
+            x0, y0 = int(px), int(py)
             fx, fy = np.float32(px - x0), np.float32(py - y0)
             upper = (one - fx) * template[y0, x0] + fx * template[y0, x0 + 1]
             lower = (one - fx) * template[y0 + 1, x0] + fx * template[y0 + 1, x0 + 1]
-            value = (one - fy) * upper + fy * lower
-            patch[j, i] = value
-            total += value
-            squares += value * value
-    mean = total / np.float32(side * side)
+            patch[j, i] = (one - fy) * upper + fy * lower
+            mean += patch[j, i]
+    mean /= np.float32(side * side)
     for j in range(side):
         for i in range(side):
             patch[j, i] -= mean
-    return squares - total * mean
+            squares += patch[j, i] * patch[j, i]
+    return squares
 
 
-@kernel(fastmath={"reassoc", "contract"})
-def _dot(patch, window, j0, i0):
-    total = np.float32(0.0)
-    for j in range(len(patch)):
-        for i in range(len(patch)):
-            total += patch[j, i] * window[j0 + j, i0 + i]
-    return total
-
-
-@kernel()
-def _correlate(patch, patch_squares, window, min_squares, scores):
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"})
+def _correlate(patch, patch_squares, window, min_squares, scratch, scores):
     """Write the correlation of the patch with the window at each shift into `scores`, -1 without
-    texture. Sums over rectangles come from integral images."""
-    full, side = len(window), len(patch)
-    sums, squares = np.zeros((full + 1, full + 1)), np.zeros((full + 1, full + 1))
-    for j in range(full):
-        for i in range(full):
-            value = float(window[j, i])
-            sums[j + 1, i + 1] = sums[j, i + 1] + sums[j + 1, i] - sums[j, i] + value
-            squares[j + 1, i + 1] = (
-                squares[j, i + 1] + squares[j + 1, i] - squares[j, i] + value * value
-            )
-    for j in range(len(scores)):
-        for i in range(len(scores)):
-            b, r = j + side, i + side
-            total = sums[b, r] - sums[j, r] - sums[b, i] + sums[j, i]
-            spread = squares[b, r] - squares[j, r] - squares[b, i] + squares[j, i]
-            spread -= total * total / (side * side)
+    texture. Rows of the patch are padded by zeros to a multiple of four, the window by a row.
+    `scratch` holds three arrays of the window's shape."""
+    side, width, shifts = len(patch), window.shape[1], len(scores)
+    products, sums, squares = scratch[0], scratch[1], scratch[2]
+    # four pixels of the patch with those of all shifts: the compiler vectorizes loops over slices
+    flat, count = window.reshape(-1), (shifts - 1) * width + shifts
+    total = products.reshape(-1)[:count]
+    total[:] = 0.0
+    for j in range(side):
+        for i in range(0, patch.shape[1], 4):
+            a, b, c, d = patch[j, i], patch[j, i + 1], patch[j, i + 2], patch[j, i + 3]
+            first = j * width + i
+            p, q = flat[first : first + count], flat[first + 1 : first + 1 + count]
+            r, s = flat[first + 2 : first + 2 + count], flat[first + 3 : first + 3 + count]
+            for k in range(count):
+                total[k] += a * p[k] + b * q[k] + c * r[k] + d * s[k]
+    sums[0] = 0.0
+    squares[0] = 0.0
+    for j in range(side + shifts - 1):
+        if j >= side:
+            sums[j - side + 1] = sums[j - side] - window[j - side]
+            squares[j - side + 1] = squares[j - side] - window[j - side] * window[j - side]
+        row = max(j - side + 1, 0)
+        for i in range(width):
+            sums[row, i] += window[j, i]
+            squares[row, i] += window[j, i] * window[j, i]
+    for j in range(shifts):
+        level, square = np.sum(sums[j, :side]), np.sum(squares[j, :side])
+        for i in range(shifts):
+            spread = square - level * level / np.float32(side * side)
             scores[j, i] = -1.0
             if spread > min_squares:
-                scores[j, i] = _dot(patch, window, j, i) / np.sqrt(patch_squares * spread)
+                scores[j, i] = products[j, i] / np.sqrt(patch_squares * spread)
+            if i + 1 < shifts:
+                level += sums[j, i + side] - sums[j, i]
+                square += squares[j, i + side] - squares[j, i]
 
 
 @kernel()
@@ -371,10 +284,12 @@ def align_patches(
     pixel by the image's. The patch has an odd side, and grey levels that vary by `min_sigma`.
     """
     pixels, correlations = np.full((len(predicted), 2), np.nan), np.full(len(predicted), np.nan)
-    patch = np.zeros((patch_px, patch_px), np.float32)
+    patch = np.zeros((patch_px, -(-patch_px // 4) * 4), np.float32)
     scores = np.zeros((2 * reach_px + 1, 2 * reach_px + 1), np.float32)
     margin, last = patch_px // 2 + reach_px, 2 * reach_px
-    min_squares = min_sigma**2 * patch_px**2
+    window = np.zeros((2 * margin + 2, 2 * margin + 1), np.float32)
+    scratch = np.zeros((3, *window.shape), np.float32)
+    min_squares = np.float32(min_sigma**2 * patch_px**2)
     for k in range(len(predicted)):
         if not (np.isfinite(predicted[k, 0]) and np.isfinite(warps[k, 0, 0])):
             continue
@@ -382,13 +297,16 @@ def align_patches(
         if not (margin <= x < image.shape[1] - margin and margin <= y < image.shape[0] - margin):
             continue
         row = template_of_match[k]
-        squares = _sample_patch(
+        contrast = _sample_patch(
             templates[row], sizes[row], centres[k, 0], centres[k, 1], warps[k], patch
         )
-        if squares < min_squares:
+        if contrast < min_squares:
             continue
-        window = image[y - margin : y + margin + 1, x - margin : x + margin + 1].astype(np.float32)
-        _correlate(patch, squares, window, min_squares, scores)
+        level = np.float32(image[y, x])  # of small numbers float32 keeps more digits
+        for j in range(2 * margin + 1):
+            for i in range(2 * margin + 1):
+                window[j, i] = np.float32(image[y - margin + j, x - margin + i]) - level
+        _correlate(patch, contrast, window, min_squares, scratch, scores)
         best = np.argmax(scores)
         j, i = best // (last + 1), best % (last + 1)
         correlations[k] = -1.0

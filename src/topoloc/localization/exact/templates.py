@@ -1,0 +1,119 @@
+"""Hold the images of nodes for the comparison with a query: grey levels, and colours in small.
+
+Patches are aligned with the grey levels (`patch_alignment.py`), colours are compared
+(`appearance.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from topoloc.errors import MapError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.topomap import TopoNode
+from topoloc.recordings.frame import Image, to_grey
+
+
+@dataclass(frozen=True, eq=False)
+class NodeTemplate:
+    """Hold the image of a node. `camera` has the size of the image. An image that is missing or
+    damaged `is_black`. `colours` are its `small_colours`."""
+
+    image: UInt8[np.ndarray, "h w"]
+    camera: Camera
+    world_from_cam: Rigid3
+    is_black: bool = False
+    colours: Float[np.ndarray, "rows columns 3"] | None = None
+
+    @staticmethod
+    def of_node(node: TopoNode) -> NodeTemplate:
+        """Return the stored image of a node in grey."""
+        try:
+            image = node.read_image()
+        except MapError:
+            image = None
+        grey = np.zeros((2, 2), np.uint8) if image is None else to_grey(image)
+        camera = node.camera.rescaled(*grey.shape[::-1])
+        colours = None if image is None else small_colours(image)
+        return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None, colours)
+
+
+_COLOURS = np.array([[1.0, 1.0, 1.0], [3.0, -3.0, 0.0], [-1.5, -1.5, 3.0]]) / 3.0
+
+
+def small_colours(image: Image) -> Float[np.ndarray, "rows columns 3"] | None:
+    """Return the logarithms of brightness, red over green and blue over yellow in 80 columns. None:
+    the image is grey."""
+    if image.ndim == 2:
+        return None
+    size = 80, max(1, round(80 * image.shape[0] / image.shape[1]))
+    darkest = 8.0  # levels below are noise
+    levels = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA) + np.float32(darkest))
+    return cv2.transform(levels, _COLOURS)
+
+
+def sample_colours(
+    colours: Float[np.ndarray, "rows columns 3"], places: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return the colours at places, which are pixels over the image size."""
+    x, y = (places * colours.shape[1::-1] - 0.5).astype(np.float32).T[:, :, None]
+    sampled = cv2.remap(colours, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(-1, 3).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class PointTemplates:
+    """Hold the images of the nodes of points: that of point k is `templates[of_point[k]]`."""
+
+    templates: Sequence[NodeTemplate]
+    of_point: Int[np.ndarray, " n"]
+
+    @cached_property
+    def images(self) -> tuple[UInt8[np.ndarray, "k h w"], Int[np.ndarray, "k 2"]]:
+        """Return the images, padded to one size, and their heights and widths."""
+        sizes = np.array([one.image.shape for one in self.templates]).reshape(-1, 2)
+        images = np.zeros((len(sizes), *sizes.max(axis=0, initial=1)), np.uint8)
+        for k, one in enumerate(self.templates):
+            images[k, : sizes[k, 0], : sizes[k, 1]] = one.image
+        return images, sizes
+
+    @property
+    def rotations(self) -> Float[np.ndarray, "n 3 3"]:
+        """Return the rotation of world_from_cam of the node of each point."""
+        return np.array([one.world_from_cam.rotation for one in self.templates])[self.of_point]
+
+    @property
+    def origins(self) -> Float[np.ndarray, "n 3"]:
+        """Return the position (metres, world) of the node of each point."""
+        return np.array([one.world_from_cam.translation for one in self.templates])[self.of_point]
+
+    def in_nodes(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return points in the camera frames of their nodes, metres."""
+        return np.einsum("nji,nj->ni", self.rotations, points_world - self.origins)
+
+    def project(self, in_nodes: Float[np.ndarray, "k n 3"]) -> Float[np.ndarray, "k n 2"]:
+        """Return the pixels of k positions of each point, given in the frame of its node."""
+        pixels, cameras = np.empty((*in_nodes.shape[:2], 2)), [one.camera for one in self.templates]
+        for camera in set(cameras):
+            rows = np.flatnonzero(np.array([one == camera for one in cameras])[self.of_point])
+            projected = camera.img_from_cam(in_nodes[:, rows].reshape(-1, 3))
+            pixels[:, rows] = projected.reshape(-1, len(rows), 2)
+        return pixels
+
+    def sample_colours(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the `small_colours` of points in the images of their nodes, NaN where grey."""
+        pixels = self.project(self.in_nodes(points_world)[None])[0]
+        colours = np.full(points_world.shape, np.nan)
+        for k, template in enumerate(self.templates):
+            rows = np.flatnonzero(self.of_point == k)
+            if template.colours is not None:
+                size = [template.camera.width, template.camera.height]
+                colours[rows] = sample_colours(template.colours, pixels[rows] / size)
+        return colours
