@@ -165,7 +165,7 @@ def select_shown_points(
     rows, pixels = select_visible_points(points, cam_from_world, camera)
     places = pixels / [camera.width, camera.height]
     depths = cam_from_world.apply(points.points_world[rows])[:, 2]
-    shown = np.flatnonzero(_is_shown(places, depths, weights))
+    shown = np.flatnonzero(find_shown_points(places, depths))
     if len(shown) > 0:
         shown = shown[sample_rows(len(shown))]
     return ShownPoints(
@@ -173,10 +173,11 @@ def select_shown_points(
     )
 
 
-def _is_shown(
-    places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, " n"], weights: AppearanceWeights
+def find_shown_points(
+    places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """Return which points are not hidden by nearer ones. Places are pixels over the image size."""
+    weights = load_appearance_weights()
     counts = np.array(weights.parts)
     columns, rows = np.clip(places * counts, 0, counts - 1).astype(int).T
     part = rows * counts[0] + columns

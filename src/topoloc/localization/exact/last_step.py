@@ -1,20 +1,21 @@
-"""Refine a reported pose with all that the map knows around it.
+"""Refine a reported pose with the images of the nodes around it.
 
-The verdict needs few nodes and one feature type. Once the place is certain, points of more nodes
-and of all feature types are matched near their predicted pixels. This is safe only for a pose that
-is accurate to a few pixels: within a small radius few matches are right by chance.
+First the key points of the query are matched with points of more nodes than the verdict needed,
+near their predicted pixels. This corrects a pose that is off by several pixels.
 
-Each match is then aligned by correlation (`patch_alignment.py`). A key point lies one to three
-pixels off the described point, an aligned patch a third of a pixel. Matches that do not correlate
-are dropped.
+Then points in view are aligned by correlation with the images of their nodes
+(`patch_alignment.py`), whether or not the query has a key point there. A key point lies one to
+three pixels off the described point, an aligned patch a third of a pixel. So the query needs no
+features beyond those of the verdict.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float, Float32, Int
 
 from topoloc.geometry.absolute_pose import (
     AbsolutePose,
@@ -24,25 +25,17 @@ from topoloc.geometry.absolute_pose import (
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.localization.answer import Answer, Finding
+from topoloc.localization.exact.appearance import find_shown_points
 from topoloc.localization.exact.patch_alignment import (
     LastStepWeights,
     PreciseMatches,
     align,
     load_last_step_weights,
 )
-from topoloc.localization.guided import match_guided
+from topoloc.localization.guided import match_guided, select_visible_points
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.search import Search
-
-
-@dataclass(frozen=True, eq=False)
-class PreciseFit:
-    """Hold a pose and the matches that it was fitted to, in the reduced image."""
-
-    pose: AbsolutePose
-    matches: PreciseMatches
-    is_aligned: bool = False
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
@@ -83,22 +76,22 @@ def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
     # the feature type that found the pose comes first
     ordered = sorted(searches, key=lambda one: one.map.kind.name != pose.provenance.features)
     with first.query.clock.stage("last_step"):
-        fit = refine_precisely(ordered, pose.world_from_cam.inverse(), weights)
-        if fit is None:
+        found = refine_precisely(ordered, pose.world_from_cam.inverse(), weights)
+        if found is None:
             return None
-        seen = fit.matches.select(np.flatnonzero(fit.pose.inliers))
+        fit, aligned = found
+        seen = aligned.select(np.flatnonzero(fit.inliers))
         parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
-        cam_from_world = fit.pose.cam_from_world
+        cam_from_world = fit.cam_from_world
         inflation = compute_variance_inflation(
             *parts, first.query.camera, cam_from_world, seen.sigmas_px
         )
-    noise = inflation**2 * fit.pose.covariance
+    noise = inflation**2 * fit.covariance
     before = inverse_covariance(pose.world_from_cam, pose.covariance)
-    shared = (1.0 - pose.noise_share) * before  # key points share the errors of the verdict's
-    if fit.is_aligned:
-        # the less the nodes contradict each other, the more of their errors average out
-        shared *= min(1.0, weights.shared_error_slope * first.correlated_error_share)
-        shared += np.dot(weights.slow_errors, (1.0, 1.0 / len(seen))) * noise
+    # the less the nodes contradict each other, the more of their errors average out
+    share = min(1.0, weights.shared_error_slope * first.correlated_error_share)
+    shared = share * (1.0 - pose.noise_share) * before
+    shared += np.dot(weights.slow_errors, (1.0, 1.0 / len(seen))) * noise
     facts = {
         "world_from_cam": cam_from_world.inverse(),
         "covariance": inverse_covariance(cam_from_world, noise + shared),
@@ -110,47 +103,48 @@ def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
 
 def refine_precisely(
     searches: Sequence[Search], cam_from_world: Rigid3, weights: LastStepWeights
-) -> PreciseFit | None:
-    """Refine a pose that is accurate to some pixels. None if too few points agree."""
-    around = Surroundings.at_pose(searches, cam_from_world, weights)
-    fit = around.refine_by_key_points(cam_from_world)
-    if fit is None:
-        return None
-    inliers = fit.matches.select(np.flatnonzero(fit.pose.inliers))
-    chosen, aligned = _spread(inliers, around.camera, weights.max_aligned), fit
-    templates = searches[0].templates(chosen.node_ids)
-    for reach_px in weights.reaches_px:
-        moved = align(
-            searches[0].query.grey,
+) -> tuple[AbsolutePose, PreciseMatches] | None:
+    """Refine a pose that is accurate to some pixels. Return it with its matches, in the reduced
+    image. None if too few points agree."""
+    asked = [one for one in searches if one.first is not None]  # no features are extracted for it
+    around = Surroundings.at_pose(asked, cam_from_world, weights)
+    by_key_points = around.fit(around.match(cam_from_world), cam_from_world, weights.max_error_px)
+    if by_key_points is not None and np.count_nonzero(by_key_points.inliers) >= weights.min_matches:
+        cam_from_world = by_key_points.cam_from_world
+    shown, fit, aligned = around.points_in_view(cam_from_world), None, None
+    for max_number, reach_px in zip(weights.max_aligned, weights.reaches_px, strict=True):
+        number = min(max_number, len(shown))
+        chosen = shown.select(np.arange(number) * len(shown) // max(number, 1))
+        aligned = align(
+            asked[0].query.grey,
             around.camera,
             chosen,
-            templates,
-            aligned.pose.cam_from_world,
+            asked[0].templates(chosen.node_ids),
+            cam_from_world,
             reach_px,
+            around.growth,
             weights,
         )
-        better = around.fit(moved, aligned.pose.cam_from_world, weights.max_aligned_error_px)
-        if better is None or np.count_nonzero(better.pose.inliers) < weights.min_aligned:
-            return fit
-        aligned = better
-    return replace(aligned, is_aligned=True)
+        fit = around.fit(aligned, cam_from_world, weights.max_aligned_error_px)
+        if fit is None or np.count_nonzero(fit.inliers) < weights.min_aligned:
+            return None
+        cam_from_world = fit.cam_from_world
+    return None if fit is None or aligned is None else (fit, aligned)
 
 
-def _spread(matches: PreciseMatches, camera: Camera, max_number: int) -> PreciseMatches:
-    """Return at most `max_number` matches: in turn the most similar one of each image cell."""
-    if len(matches) <= max_number:
-        return matches
+def _in_turn(pixels: Float[np.ndarray, "n 2"], camera: Camera) -> Int[np.ndarray, " n"]:
+    """Return the rows of pixels in turn: the first one of each image cell, then the second."""
     num_columns = 16
-    columns, rows = (matches.points_img / np.float32(camera.width / num_columns)).astype(np.int64).T
+    columns, rows = (pixels / (camera.width / num_columns)).astype(np.int64).T
     cells = rows * num_columns + columns
-    order = np.lexsort((-matches.similarities, cells))
+    order = np.argsort(cells, kind="stable")
     rank = np.arange(len(order)) - np.searchsorted(cells[order], cells[order])
-    return matches.select(np.sort(order[np.argsort(rank, kind="stable")[:max_number]]))
+    return order[np.lexsort((order, rank))]
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Hold the points of the nodes near a pose, for each search of the query."""
+    """Hold the points of the nodes near a pose, nearest first, for each search of the query."""
 
     searches: Sequence[Search]
     maps: Sequence[LocalMap]
@@ -169,43 +163,49 @@ class Surroundings:
         """Return the camera of the query."""
         return self.searches[0].query.camera
 
-    def refine_by_key_points(self, cam_from_world: Rigid3) -> PreciseFit | None:
-        """Refine the pose in two rounds: with the first search, then with all and tighter."""
-        fit, num_searches = None, (1, len(self.searches))
-        for number, radius_px, max_error_px in zip(
-            num_searches, self.weights.radii_px, self.weights.max_errors_px, strict=True
-        ):
-            matches = self.match(cam_from_world, radius_px, number)
-            fit = self.fit(matches, cam_from_world, max_error_px)
-            if fit is None:
-                return None
-            cam_from_world = fit.pose.cam_from_world
-        return fit
+    @property
+    def growth(self) -> float:
+        """Return by how much of the square of its distance the variance of a node grows."""
+        return min(1.0, self.searches[0].correlated_error_share / self.weights.full_growth_share)
 
-    def match(self, cam_from_world: Rigid3, radius_px: float, num_searches: int) -> PreciseMatches:
-        """Match the key points of the first searches within a radius of the predicted pixels."""
+    def match(self, cam_from_world: Rigid3) -> PreciseMatches:
+        """Match key points near the predicted pixels."""
         parts = list[PreciseMatches]()
-        for search, points in zip(self.searches[:num_searches], self.maps, strict=False):
+        for search, points in zip(self.searches, self.maps, strict=True):
             features = search.query.features
-            config = replace(search.config.guided, radius_px=radius_px)
+            config = replace(search.config.guided, radius_px=self.weights.radius_px)
             matches = match_guided(features, points, cam_from_world, self.camera, config)
-            rows = matches.train_idx
-            parts.append(
-                PreciseMatches(
-                    features.points_img[matches.query_idx],
-                    points.points_world[rows],
-                    points.covariances[rows],
-                    points.node_ids[rows],
-                    1.0 - np.square(matches.distances.astype(np.float64)) / 2.0,
-                    np.full(len(rows), self.weights.key_point_sigma_px),
-                )
-            )
-        columns = ([getattr(part, one.name) for part in parts] for one in fields(PreciseMatches))
-        return PreciseMatches(*(np.concatenate(column) for column in columns))
+            found = features.points_img[matches.query_idx]
+            parts.append(self._matches(found, points, matches.train_idx))
+        return PreciseMatches.concatenate(parts)
 
-    def fit(self, matches: PreciseMatches, start: Rigid3, max_error_px: float) -> PreciseFit | None:
+    def points_in_view(self, cam_from_world: Rigid3) -> PreciseMatches:
+        """Return the points in view at their predicted pixels, in turn from each image cell those
+        of the nearest node first."""
+        parts = list[PreciseMatches]()
+        for points in self.maps:
+            rows, pixels = select_visible_points(points, cam_from_world, self.camera)
+            places = pixels / [self.camera.width, self.camera.height]
+            depths = cam_from_world.apply(points.points_world[rows])[:, 2]
+            is_shown = find_shown_points(places, depths)
+            parts.append(self._matches(pixels[is_shown].astype(np.float32), points, rows[is_shown]))
+        shown = PreciseMatches.concatenate(parts)
+        return shown.select(
+            _in_turn(shown.points_img, self.camera)[: max(self.weights.max_aligned)]
+        )
+
+    def _matches(
+        self, pixels: Float32[np.ndarray, "n 2"], points: LocalMap, rows: np.ndarray
+    ) -> PreciseMatches:
+        sigmas = np.full(len(rows), self.weights.key_point_sigma_px)
+        parts = points.points_world[rows], points.covariances[rows], points.node_ids[rows]
+        return PreciseMatches(pixels, *parts, sigmas)
+
+    def fit(
+        self, matches: PreciseMatches, start: Rigid3, max_error_px: float
+    ) -> AbsolutePose | None:
         """Fit the pose to matches. None if too few agree."""
-        pose = refine_absolute_pose(
+        return refine_absolute_pose(
             matches.points_img.astype(np.float64),
             matches.points_world,
             matches.covariances,
@@ -214,6 +214,3 @@ class Surroundings:
             start,
             max_error_px * self.camera.radius_scale,
         )
-        if pose is None or np.count_nonzero(pose.inliers) < self.weights.min_matches:
-            return None
-        return PreciseFit(pose, matches)

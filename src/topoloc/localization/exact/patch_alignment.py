@@ -6,6 +6,7 @@ query image. This is adaptive least-squares correlation (Gruen, 1985) with a shi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -26,14 +27,19 @@ from topoloc.localization.pose_fit import PointObservations
 class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the numbers of the last step (`last_step.py`).
 
-    - `num_nodes`: nodes nearest to the pose whose points are matched.
-    - `radii_px`, `max_errors_px`: search radii and inlier limits of the two rounds of matching, in
-      pixels of an image whose longer side is 640. `key_point_sigma_px`: error of a key point.
-    - `max_aligned`: matches that are aligned at most, in rounds that search up to `reaches_px`, by
+    - `num_nodes`: nodes nearest to the pose whose points are used. Key points are matched within
+      `radius_px` and are inliers within `max_error_px`, in pixels of an image whose longer side is
+      640. Their error is `key_point_sigma_px`. Fewer than `min_matches` inliers correct nothing.
+    - `max_aligned`: points that are aligned at most, in rounds that search up to `reaches_px`, by
       patches of `patch_px` squared pixels whose grey levels vary by `min_patch_sigma`. At least
-      `min_aligned` must agree within `max_aligned_error_px`. `correlations`, `aligned_sigmas_px`:
-      table of the error of an aligned pixel. Matches below the first correlation are dropped.
-      A pose of key points needs `min_matches`.
+      `min_aligned` must agree within `max_aligned_error_px`.
+    - Patches that correlate by less than `min_correlation` are dropped. The variance of an aligned
+      pixel is `variance` times (1 - correlation) over the second derivative of the correlation,
+      plus `least_sigma_px` squared. It differs by direction: an edge fixes the pixel across, but
+      not along it. Its root is at most `max_sigma_px` across, and `max_edge_sigma_px` along.
+    - Variances grow with the square of the node's distance, over that of the nearest node, as
+      poses of nodes are less exact the farther they are apart. They do so in full in maps whose
+      rho is `full_growth_share`, and in proportion below.
     - `max_correlated_error_share`: rho of a map above which the step is left out.
     - `shared_error_slope`: times rho, it is the share of the verdict's correlated covariance that
       remains. `slow_errors` (a, b): errors that vary slowly over the image move the pose and leave
@@ -44,18 +50,22 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     date: str
     command: str
     num_nodes: int
-    radii_px: tuple[Finite, Finite]
-    max_errors_px: tuple[Finite, Finite]
+    radius_px: Finite
+    max_error_px: Finite
     key_point_sigma_px: Finite
     min_matches: int
     min_aligned: int
-    max_aligned: int
+    max_aligned: tuple[int, ...]
     reaches_px: tuple[int, ...]
     max_aligned_error_px: Finite
     patch_px: int
     min_patch_sigma: Finite
-    correlations: tuple[Finite, ...]
-    aligned_sigmas_px: tuple[Finite, ...]
+    min_correlation: Finite
+    variance: Finite
+    least_sigma_px: Finite
+    max_sigma_px: Finite
+    max_edge_sigma_px: Finite
+    full_growth_share: Finite
     max_correlated_error_share: Finite
     shared_error_slope: Finite
     slow_errors: tuple[Finite, Finite]
@@ -74,11 +84,17 @@ def load_last_step_weights() -> LastStepWeights:
 
 @dataclass(frozen=True, eq=False)
 class PreciseMatches(PointObservations):
-    """Hold matches of all feature types. `sigmas_px` is the standard deviation of each pixel."""
+    """Hold points of all feature types at pixels of the query, with the standard deviation of each
+    pixel."""
 
     node_ids: Int[np.ndarray, " n"]
-    similarities: Float[np.ndarray, " n"]
     sigmas_px: Float[np.ndarray, " n"]
+
+    @staticmethod
+    def concatenate(parts: Sequence[PreciseMatches]) -> PreciseMatches:
+        """Return all matches."""
+        columns = ([getattr(part, one.name) for part in parts] for one in fields(PreciseMatches))
+        return PreciseMatches(*(np.concatenate(column) for column in columns))
 
     def select(self, rows: np.ndarray) -> PreciseMatches:
         """Return the given rows."""
@@ -88,25 +104,43 @@ class PreciseMatches(PointObservations):
 def align(
     image: UInt8[np.ndarray, "h w"],
     camera: Camera,
-    matches: PreciseMatches,
+    points: PreciseMatches,
     templates: PointTemplates,
     cam_from_world: Rigid3,
     reach_px: int,
+    growth: float,
     weights: LastStepWeights,
 ) -> PreciseMatches:
-    """Align matches by correlation with the nodes' images. Matches that do not correlate are
-    dropped. Of the error of a point, that along the ray of its node remains: its pixel in the
-    node's image is where the patch was taken."""
-    points_world = matches.points_world
-    view = predict_patches(points_world, templates, cam_from_world, camera)
-    pixels, correlations = correlate(image, view, reach_px, weights)
-    rows = np.flatnonzero(correlations > weights.correlations[0])
-    sigmas = np.interp(correlations[rows], weights.correlations, weights.aligned_sigmas_px)
-    found, rays = matches.select(rows), points_world[rows] - templates.origins[rows]
+    """Align points by correlation with the nodes' images. Those that do not correlate are dropped.
+
+    Of the error of a point, that along the ray of its node remains: its pixel in the node's image
+    is where the patch was taken. The error of the pixel along an edge is added to it. `growth` is
+    that of variances with the square of the node's distance.
+    """
+    view = predict_patches(points.points_world, templates, cam_from_world, camera)
+    pixels, correlations, bends = correlate(image, view, reach_px, weights)
+    bend, directions = np.linalg.eigh(bends)  # ascending: first along the edge
+    noise = weights.variance * (1.02 - correlations[:, None])  # of the query, even if alike
+    variances = noise / np.maximum(bend, 1e-5) + weights.least_sigma_px**2
+    away = np.linalg.norm(templates.origins - cam_from_world.inverse().translation, axis=1)
+    ratios = away / max(away.min(initial=np.inf), 1e-3)
+    variances *= 1.0 + growth * (ratios[:, None] ** 2 - 1.0)
+    is_kept = (correlations > weights.min_correlation) & (bend[:, 0] > 0.0)
+    rows = np.flatnonzero(is_kept & (variances[:, 1] < weights.max_sigma_px**2))
+    found, rays = points.select(rows), (points.points_world - templates.origins)[rows]
     along = np.einsum("ni,nj,nk,nl,nkl->nij", rays, rays, rays, rays, found.covariances)
     along /= np.square(np.sum(rays**2, axis=1))[:, None, None]
+    wide, narrow = variances[rows].T
+    depths = cam_from_world.apply(found.points_world)[:, 2]
+    edge_px = np.sqrt(np.minimum(wide - narrow, weights.max_edge_sigma_px**2))
+    edges = directions[rows, :, 0] @ cam_from_world.rotation[:2]
+    edges *= (edge_px * depths / camera.fx)[:, None]
+    along += edges[:, :, None] * edges[:, None, :]
     return replace(
-        found, points_img=pixels[rows].astype(np.float32), sigmas_px=sigmas, covariances=along
+        found,
+        points_img=pixels[rows].astype(np.float32),
+        sigmas_px=np.sqrt(narrow),
+        covariances=along,
     )
 
 
@@ -150,22 +184,23 @@ def correlate(
     patches: PredictedPatches,
     reach_px: int,
     weights: LastStepWeights,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Return the pixels where patches correlate best with an image, and the correlations as
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"], Float[np.ndarray, "n 2 2"]]:
+    """Return the pixels where patches correlate best with an image, the correlations and bends as
     `align_patches` does."""
     templates, count = patches.templates, len(patches.predicted)
     images, sizes = templates.images
-    pixels, correlations = np.empty((count, 2)), np.empty(count)
+    pixels, correlations, bends = np.empty((count, 2)), np.empty(count), np.empty((count, 2, 2))
 
     def align_band(first: int, last: int) -> None:
         band = slice(first, last)
         of_point, predicted = templates.of_point[band], patches.predicted[band]
         projected = of_point, predicted, patches.centres[band], patches.warps[band]
         numbers = weights.patch_px, reach_px, weights.min_patch_sigma
-        pixels[band], correlations[band] = align_patches(image, images, sizes, *projected, *numbers)
+        found = align_patches(image, images, sizes, *projected, *numbers)
+        pixels[band], correlations[band], bends[band] = found
 
     parallel_for_rows(align_band, count)
-    return pixels, correlations
+    return pixels, correlations, bends
 
 
 # Numba kernels
@@ -242,24 +277,24 @@ def _correlate(patch, patch_squares, window, min_squares, scratch, scores):
 
 
 @kernel()
-def _find_peak(scores, i, j):
+def _find_peak(scores, i, j, bend):
     """Return the offset (x, y) of the peak of the quadratic through the 3 x 3 scores around (i, j),
-    at most a pixel."""
+    at most a pixel. Write its negative second derivatives into `bend` (2, 2)."""
     best = scores[j, i]
     slope_x, slope_y = (
         0.5 * (scores[j, i + 1] - scores[j, i - 1]),
         0.5 * (scores[j + 1, i] - scores[j - 1, i]),
     )
-    bend_x = scores[j, i + 1] - 2.0 * best + scores[j, i - 1]
-    bend_y = scores[j + 1, i] - 2.0 * best + scores[j - 1, i]
-    twist = 0.25 * (
-        scores[j + 1, i + 1] - scores[j + 1, i - 1] - scores[j - 1, i + 1] + scores[j - 1, i - 1]
+    bend[0, 0] = 2.0 * best - scores[j, i + 1] - scores[j, i - 1]
+    bend[1, 1] = 2.0 * best - scores[j + 1, i] - scores[j - 1, i]
+    bend[0, 1] = bend[1, 0] = 0.25 * (
+        scores[j + 1, i - 1] + scores[j - 1, i + 1] - scores[j + 1, i + 1] - scores[j - 1, i - 1]
     )
-    determinant = bend_x * bend_y - twist * twist
-    if not (bend_x < 0.0 and determinant > 0.0):
+    determinant = bend[0, 0] * bend[1, 1] - bend[0, 1] * bend[0, 1]
+    if not (bend[0, 0] > 0.0 and determinant > 0.0):
         return 0.0, 0.0
-    x = (twist * slope_y - bend_y * slope_x) / determinant
-    y = (twist * slope_x - bend_x * slope_y) / determinant
+    x = (bend[1, 1] * slope_x - bend[0, 1] * slope_y) / determinant
+    y = (bend[0, 0] * slope_y - bend[0, 1] * slope_x) / determinant
     return min(max(x, -1.0), 1.0), min(max(y, -1.0), 1.0)
 
 
@@ -277,13 +312,15 @@ def align_patches(
     min_sigma,
 ):
     """Return the pixel of each match in `image` at which the patch around `centres` in its template
-    correlates best, at most `reach_px` from `predicted`, and the correlation: -1 if it is best at
-    the border of the search, NaN if a patch is outside or has no texture.
+    correlates best, at most `reach_px` from `predicted`, the correlation, and its negative second
+    derivatives (2, 2). The correlation is -1 if it is best at the border of the search, NaN if a
+    patch is outside or has no texture.
 
     `sizes` are the heights and widths of `templates`, `warps` the derivatives of a template's
     pixel by the image's. The patch has an odd side, and grey levels that vary by `min_sigma`.
     """
     pixels, correlations = np.full((len(predicted), 2), np.nan), np.full(len(predicted), np.nan)
+    bends = np.zeros((len(predicted), 2, 2))
     patch = np.zeros((patch_px, -(-patch_px // 4) * 4), np.float32)
     scores = np.zeros((2 * reach_px + 1, 2 * reach_px + 1), np.float32)
     margin, last = patch_px // 2 + reach_px, 2 * reach_px
@@ -311,7 +348,7 @@ def align_patches(
         j, i = best // (last + 1), best % (last + 1)
         correlations[k] = -1.0
         if 0 < i < last and 0 < j < last:
-            dx, dy = _find_peak(scores, i, j)
+            dx, dy = _find_peak(scores, i, j, bends[k])
             pixels[k, 0], pixels[k, 1] = x + i - reach_px + dx, y + j - reach_px + dy
             correlations[k] = scores[j, i]
-    return pixels, correlations
+    return pixels, correlations, bends
