@@ -89,7 +89,7 @@ def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
     node = _node(np.random.default_rng(0))
     local_map = LocalMap.of_node(node)
     matches = match_guided(_seen(node, cam_from_world), local_map, cam_from_world, CAMERA, GUIDED)
-    num_visible = len(select_visible_points(local_map, cam_from_world, CAMERA)[0])
+    num_visible = len(select_visible_points(local_map.points_world, cam_from_world, CAMERA)[0])
     assert num_visible > 100
     assert len(matches) > 0.95 * num_visible
     assert np.array_equal(matches.query_idx, matches.train_idx)
@@ -114,14 +114,14 @@ def test_a_key_point_is_matched_once_though_two_nodes_hold_it():
 def test_nothing_is_visible_behind_the_camera():
     local_map = LocalMap.of_node(_node(np.random.default_rng(3)))
     backwards = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
-    assert len(select_visible_points(local_map, backwards, CAMERA)[0]) == 0
+    assert len(select_visible_points(local_map.points_world, backwards, CAMERA)[0]) == 0
 
 
 def test_points_are_seen_from_the_side_of_their_node_only():
     points = LocalMap.of_node(_node(np.random.default_rng(7)))
     at_node, behind = Rigid3.identity(), Rigid3(np.diag([-1.0, 1.0, -1.0]), np.array([0, 0, 6.0]))
     assert count_seen_points(points, np.zeros(3), at_node, CAMERA) == NUM_POINTS
-    assert len(select_visible_points(points, behind, CAMERA)[0]) > 0.3 * NUM_POINTS
+    assert len(select_visible_points(points.points_world, behind, CAMERA)[0]) > 0.3 * NUM_POINTS
     assert count_seen_points(points, np.zeros(3), behind, CAMERA) == 0
 
 
@@ -184,7 +184,8 @@ def test_a_pinhole_predicts_the_pixels_of_a_barely_distorted_camera():
         np.testing.assert_allclose(plain, by_camera, rtol=1e-6)
         assert 0 < np.isnan(plain[:, 0]).sum() < len(plain)
         (rows, pixels), (lens_rows, lens_pixels) = (
-            select_visible_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens)
+            select_visible_points(local_map.points_world, cam_from_world, camera)
+            for camera in (CAMERA, lens)
         )
         np.testing.assert_array_equal(rows, lens_rows)
         np.testing.assert_allclose(pixels, lens_pixels, rtol=1e-9)

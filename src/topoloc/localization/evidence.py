@@ -224,7 +224,9 @@ def _count_found_points(
     perturbation of cam_from_world.
     """
     dense, agreeing_img, points = final.features.dense, None, final.local_map
-    visible, visible_img = select_visible_points(points, final.pose.cam_from_world, final.camera)
+    visible, visible_img = select_visible_points(
+        points.points_world, final.pose.cam_from_world, final.camera
+    )
     num_visible = len(visible_img)
     if dense is not None and num_visible > 0:
         sampled = sample_rows(num_visible)  # more points do not change the ratio

@@ -142,10 +142,10 @@ def _match_predictions(
 
 
 def select_visible_points(
-    local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
+    points_world: Float[np.ndarray, "n 3"], cam_from_world: Rigid3, camera: Camera
 ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 2"]]:
-    """Return the rows of the map points in the camera's view, and their pixels."""
-    _, pixels = _project_points(local_map, cam_from_world, camera)
+    """Return the rows of the points (metres) in the camera's view, and their pixels."""
+    _, pixels = _project_points(points_world, cam_from_world, camera)
     rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
     return rows, pixels[rows]
 
@@ -158,7 +158,7 @@ def count_seen_points(
     `centre` is the node's position (world).
     """
     min_cosine = 0.6
-    rows, _ = select_visible_points(local_map, cam_from_world, camera)
+    rows, _ = select_visible_points(local_map.points_world, cam_from_world, camera)
     points = local_map.points_world[rows]
     rays = points - centre, points - cam_from_world.inverse().translation
     lengths = np.prod([np.linalg.norm(one, axis=1) for one in rays], axis=0)
@@ -166,13 +166,13 @@ def count_seen_points(
 
 
 def _project_points(
-    local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
+    points_world: Float[np.ndarray, "n 3"], cam_from_world: Rigid3, camera: Camera
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
-    """Return the map points in the camera frame (metres) and their pixels, NaN if out of view."""
+    """Return points in the camera frame (metres) and their pixels, NaN if out of view."""
     if not camera.is_distorted:
         fx, fy, cx, cy = camera.intrinsics
         points_cam, pixels = project_undistorted(
-            local_map.points_world,
+            points_world,
             np.ascontiguousarray(cam_from_world.rotation),
             np.ascontiguousarray(cam_from_world.translation),
             (fx, fy),
@@ -183,7 +183,7 @@ def _project_points(
         if camera.mask is None:
             return points_cam, pixels
     else:
-        points_cam = cam_from_world.apply(local_map.points_world)
+        points_cam = cam_from_world.apply(points_world)
         pixels = camera.img_from_cam(points_cam)
     return points_cam, np.where(camera.is_in_image(pixels)[:, None], pixels, np.nan)
 
@@ -196,7 +196,7 @@ def predict_key_points(
     The surface is assumed to face the node's camera. `max_scale` and `max_turn` allow for its
     slant.
     """
-    points_cam, pixels = _project_points(local_map, cam_from_world, camera)
+    points_cam, pixels = _project_points(local_map.points_world, cam_from_world, camera)
     rotation = np.ascontiguousarray(cam_from_world.rotation)
     return predict_from_pixels(
         points_cam, pixels, local_map.sizes, local_map.directions, rotation, float(camera.fx)

@@ -13,7 +13,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import OneLine
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.exact.templates import PointTemplates
+from topoloc.localization.exact.templates import NodeTemplates, PointTemplates
 from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.pose_fit import PointMatches, PoseFit
@@ -181,7 +181,7 @@ class Search:
         if self.trace is not None:
             pairs = zip(node_ids.tolist(), templates, strict=True)
             self.trace.nodes_without_image.update(one for one, image in pairs if image.is_black)
-        return PointTemplates(templates, of_point)
+        return PointTemplates(NodeTemplates(templates), of_point)
 
 
 def verify(proposal: Proposal) -> None:

@@ -160,17 +160,17 @@ def select_shown_points(
     weights, opened = load_appearance_weights(), search.map
     # the nodes near a pose beside a bend look past its walls; those of its inliers do not
     seen_from = opened.node_poses.world_from_node(opened.topomap.row_of(node_id))
-    points = opened.local_map(opened.nearest(seen_from, weights.num_nodes))
+    nodes = opened.local_maps(opened.nearest(seen_from, weights.num_nodes))
+    points_world = np.concatenate([one.points_world for one in nodes])
     cam_from_world = world_from_cam.inverse()
-    rows, pixels = select_visible_points(points, cam_from_world, camera)
+    rows, pixels = select_visible_points(points_world, cam_from_world, camera)
     places = pixels / [camera.width, camera.height]
-    depths = cam_from_world.apply(points.points_world[rows])[:, 2]
+    depths = cam_from_world.apply(points_world[rows])[:, 2]
     shown = np.flatnonzero(find_shown_points(places, depths))
     if len(shown) > 0:
         shown = shown[sample_rows(len(shown))]
-    return ShownPoints(
-        places[shown], points.points_world[rows[shown]], points.node_ids[rows[shown]]
-    )
+    node_ids = np.concatenate([one.node_ids for one in nodes])
+    return ShownPoints(places[shown], points_world[rows[shown]], node_ids[rows[shown]])
 
 
 def find_shown_points(

@@ -112,14 +112,15 @@ def refine_precisely(
     if by_key_points is not None and np.count_nonzero(by_key_points.inliers) >= weights.min_matches:
         cam_from_world = by_key_points.cam_from_world
     shown, fit, aligned = around.points_in_view(cam_from_world), None, None
+    templates = asked[0].templates(shown.node_ids)
     for max_number, reach_px in zip(weights.max_aligned, weights.reaches_px, strict=True):
         number = min(max_number, len(shown))
-        chosen = shown.select(np.arange(number) * len(shown) // max(number, 1))
+        rows = np.arange(number) * len(shown) // max(number, 1)
         aligned = align(
             asked[0].query.grey,
             around.camera,
-            chosen,
-            asked[0].templates(chosen.node_ids),
+            shown.select(rows),
+            replace(templates, of_point=templates.of_point[rows]),
             cam_from_world,
             reach_px,
             around.growth,
@@ -184,7 +185,7 @@ class Surroundings:
         of the nearest node first."""
         parts = list[PreciseMatches]()
         for points in self.maps:
-            rows, pixels = select_visible_points(points, cam_from_world, self.camera)
+            rows, pixels = select_visible_points(points.points_world, cam_from_world, self.camera)
             places = pixels / [self.camera.width, self.camera.height]
             depths = cam_from_world.apply(points.points_world[rows])[:, 2]
             is_shown = find_shown_points(places, depths)

@@ -128,19 +128,20 @@ def align(
     is_kept = (correlations > weights.min_correlation) & (bend[:, 0] > 0.0)
     rows = np.flatnonzero(is_kept & (variances[:, 1] < weights.max_sigma_px**2))
     found, rays = points.select(rows), (points.points_world - templates.origins)[rows]
-    along = np.einsum("ni,nj,nk,nl,nkl->nij", rays, rays, rays, rays, found.covariances)
-    along /= np.square(np.sum(rays**2, axis=1))[:, None, None]
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    along = np.einsum("ni,nij,nj->n", rays, found.covariances, rays)
+    covariances = along[:, None, None] * rays[:, :, None] * rays[:, None, :]
     wide, narrow = variances[rows].T
     depths = cam_from_world.apply(found.points_world)[:, 2]
     edge_px = np.sqrt(np.minimum(wide - narrow, weights.max_edge_sigma_px**2))
     edges = directions[rows, :, 0] @ cam_from_world.rotation[:2]
     edges *= (edge_px * depths / camera.fx)[:, None]
-    along += edges[:, :, None] * edges[:, None, :]
+    covariances += edges[:, :, None] * edges[:, None, :]
     return replace(
         found,
         points_img=pixels[rows].astype(np.float32),
         sigmas_px=np.sqrt(narrow),
-        covariances=along,
+        covariances=covariances,
     )
 
 
@@ -188,7 +189,7 @@ def correlate(
     """Return the pixels where patches correlate best with an image, the correlations and bends as
     `align_patches` does."""
     templates, count = patches.templates, len(patches.predicted)
-    images, sizes = templates.images
+    images, sizes = templates.templates.images
     pixels, correlations, bends = np.empty((count, 2)), np.empty(count), np.empty((count, 2, 2))
 
     def align_band(first: int, last: int) -> None:

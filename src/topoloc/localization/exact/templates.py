@@ -6,7 +6,6 @@ Patches are aligned with the grey levels (`patch_alignment.py`), colours are com
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -68,21 +67,25 @@ def sample_colours(
     return sampled.reshape(-1, 3).astype(np.float64)
 
 
+class NodeTemplates(tuple[NodeTemplate, ...]):
+    """Hold the images of some nodes."""
+
+    @cached_property
+    def images(self) -> tuple[UInt8[np.ndarray, "k h w"], Int[np.ndarray, "k 2"]]:
+        """Return the grey images, padded to one size, and their heights and widths."""
+        sizes = np.array([one.image.shape for one in self]).reshape(-1, 2)
+        images = np.zeros((len(sizes), *sizes.max(axis=0, initial=1)), np.uint8)
+        for k, one in enumerate(self):
+            images[k, : sizes[k, 0], : sizes[k, 1]] = one.image
+        return images, sizes
+
+
 @dataclass(frozen=True, eq=False)
 class PointTemplates:
     """Hold the images of the nodes of points: that of point k is `templates[of_point[k]]`."""
 
-    templates: Sequence[NodeTemplate]
+    templates: NodeTemplates
     of_point: Int[np.ndarray, " n"]
-
-    @cached_property
-    def images(self) -> tuple[UInt8[np.ndarray, "k h w"], Int[np.ndarray, "k 2"]]:
-        """Return the images, padded to one size, and their heights and widths."""
-        sizes = np.array([one.image.shape for one in self.templates]).reshape(-1, 2)
-        images = np.zeros((len(sizes), *sizes.max(axis=0, initial=1)), np.uint8)
-        for k, one in enumerate(self.templates):
-            images[k, : sizes[k, 0], : sizes[k, 1]] = one.image
-        return images, sizes
 
     @property
     def rotations(self) -> Float[np.ndarray, "n 3 3"]:

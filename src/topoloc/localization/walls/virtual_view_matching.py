@@ -125,7 +125,7 @@ def count_virtual_views(
     visible_img, agreeing_img = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for side, local_map in sides:
         view, side_from_world = side.view, side.view.virtual_from_world(cam_from_world)
-        rows, visible = select_visible_points(local_map, side_from_world, view.camera)
+        rows, visible = select_visible_points(local_map.points_world, side_from_world, view.camera)
         last = [view.camera.width - 1, view.camera.height - 1]
         columns, lines = np.clip(np.rint(visible).astype(int), 0, last).T
         seen = np.flatnonzero(view.inside[lines, columns])
