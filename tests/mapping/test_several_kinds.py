@@ -18,6 +18,7 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.localization.feature_map import FeatureMap
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.config import MapConfig
@@ -97,6 +98,15 @@ def test_it_localizes_with_the_second_type_alone(path: Path):
 def test_a_feature_type_outside_of_the_map_is_refused(of_two: TopoMetricMap):
     with pytest.raises(FeatureTypeError, match=r"no features xfeat \(it holds: surf, sift\)"):
         FeatureMap(of_two, kind="xfeat")
+
+
+def test_a_query_that_one_type_settles_extracts_no_other(of_two: TopoMetricMap):
+    ((picture, truth), *_) = unseen_views()
+    query = QueryImage(picture, CAMERA)
+    result, _ = Localizer(of_two).localize_query(query)
+    assert isinstance(result, Localization)
+    assert translation_error(result.world_from_cam, truth) < 0.01
+    assert {config.kind for _, _, config, _ in query.features._kept} == {"surf"}
 
 
 def test_the_cells_of_a_network_are_learned_stored_and_used(
