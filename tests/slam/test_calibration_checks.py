@@ -19,6 +19,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import Recording, with_poses
+from topoloc.slam import calibration_checks
 from topoloc.slam.calibration_checks import find_image_faults
 from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.pose_checks import check_poses
@@ -81,6 +82,26 @@ def test_the_remedy_for_a_wrong_focal_length_works(shared: Path, factor: float):
     check_poses(with_focal(right, found / right.camera.fx))
     (note,) = find_image_faults(with_poses(with_focal(right, factor), [None] * len(right)))
     assert "a focal length of about" in note
+
+
+@pytest.mark.parametrize(
+    ("logs", "is_wrong"),
+    [
+        ((0.06, 0.27, 0.29, 0.34, 0.59), False),  # a corridor whose focal length is right
+        ((0.09, 0.1, 0.1, 0.11, 0.12), True),
+        ((-0.09, -0.1, -0.1, -0.11, -0.12), True),
+        ((0.1, 0.1, 0.1, 0.1), False),  # too few
+        ((0.0, 0.0, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1), False),
+        ((0.0, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1), True),
+    ],
+)
+def test_a_focal_length_is_accused_if_nearly_all_steps_agree(
+    logs: tuple[float, ...], is_wrong: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(calibration_checks, "_estimate_focal_errors", lambda steps: list(logs))
+    sequence = FrameList([stereo_frame(place) for place in PLACES[:2]])
+    problem = calibration_checks._find_focal_problem(sequence, [])
+    assert (problem is not None) == is_wrong
 
 
 def test_a_right_recording_without_poses_has_no_fault(shared: Path):
