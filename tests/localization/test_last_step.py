@@ -24,6 +24,8 @@ from topoloc.localization.exact.patch_alignment import (
 )
 from topoloc.localization.exact.templates import NodeTemplate, NodeTemplates, PointTemplates
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_query import MapQuery
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.result import Localization
 from topoloc.localization.search import Trace
 from topoloc.mapping.mapping_frames import encode_small
@@ -74,6 +76,18 @@ def test_a_pose_that_cannot_be_aligned_stays_as_it_was(
     np.testing.assert_array_equal(found.world_from_cam.matrix(), first.world_from_cam.matrix())
     np.testing.assert_array_equal(found.covariance, first.covariance)
     assert aligned.position_sigma_m < found.position_sigma_m
+
+
+def test_a_pose_without_points_in_view_is_left_alone(room: TopoMetricMap):
+    image, truth = unseen_views()[2]
+    localizer, clock = Localizer(room), StageClock()
+    searches = localizer.context.searches(QueryImage(image, CAMERA), clock, Deadline())
+    query = MapQuery(localizer.context, searches)
+    query.search_first()
+    weights = load_last_step_weights()
+    assert last_step.refine_precisely(searches, truth.inverse(), weights) is not None
+    behind = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3)) @ truth.inverse()
+    assert last_step.refine_precisely(searches, behind, weights) is None
 
 
 def test_strong_distortion_is_part_of_the_warp(room: TopoMetricMap):

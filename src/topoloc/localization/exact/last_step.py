@@ -112,10 +112,12 @@ def refine_precisely(
     if by_key_points is not None and np.count_nonzero(by_key_points.inliers) >= weights.min_matches:
         cam_from_world = by_key_points.cam_from_world
     shown, fit, aligned = around.points_in_view(cam_from_world), None, None
+    if len(shown) < weights.min_aligned:
+        return None
     templates = asked[0].templates(shown.node_ids)
     for max_number, reach_px in zip(weights.max_aligned, weights.reaches_px, strict=True):
         number = min(max_number, len(shown))
-        rows = np.arange(number) * len(shown) // max(number, 1)
+        rows = np.arange(number) * len(shown) // number
         aligned = align(
             asked[0].query.grey,
             around.camera,
