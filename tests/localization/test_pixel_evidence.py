@@ -15,13 +15,14 @@ from tiny_world import CAMERA
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import Answer, lead
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.exact import patch_alignment, pixel_evidence
+from topoloc.localization.exact import pixel_evidence
 from topoloc.localization.exact.pixel_evidence import (
     PixelAgreement,
     load_pixel_weights,
     measure_pixels,
     weigh_pixels,
 )
+from topoloc.localization.exact.templates import NodeTemplate
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.query import Deadline, QueryImage, StageClock
@@ -139,9 +140,9 @@ def test_pixels_do_not_tell_two_poses_apart(room: TopoMetricMap, monkeypatch: py
 def test_without_images_of_the_nodes_a_refusal_remains(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
-    read = patch_alignment.NodeTemplate.of_node
+    read = NodeTemplate.of_node
     monkeypatch.setattr(
-        patch_alignment.NodeTemplate,
+        NodeTemplate,
         "of_node",
         staticmethod(lambda node: read(replace(node, template_image=b""))),
     )
