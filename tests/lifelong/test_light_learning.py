@@ -100,7 +100,8 @@ def test_a_session_that_extends_the_map_keeps_its_room(
             Rigid3(exp_so3(np.array([0.0, 0.17, 0.0])), np.zeros(3)),
             "do not agree with the map; give",
         ),
-        (Rigid3(np.eye(3), np.array([0.0, 2.0, 0.0])), "do not agree with the map; give"),
+        # the adjusted poses agree within centimetres, but not with the images
+        (Rigid3(np.eye(3), np.array([0.0, 2.0, 0.0])), "taught it nothing"),
         (
             Rigid3(exp_so3(np.array([0.17, 0.0, 0.0])), np.zeros(3)),
             "agree with its poses; no map is",
