@@ -106,12 +106,13 @@ def refine_precisely(
 ) -> tuple[AbsolutePose, PreciseMatches] | None:
     """Refine a pose that is accurate to some pixels. Return it with its matches, in the reduced
     image. None if too few points agree."""
-    asked = [one for one in searches if one.first is not None]  # no features are extracted for it
+    # the features of the others are not extracted yet
+    asked = [one for one in searches if one.first is not None]
     around = Surroundings.at_pose(asked, cam_from_world, weights)
     by_key_points = around.fit(around.match(cam_from_world), cam_from_world, weights.max_error_px)
     if by_key_points is not None and np.count_nonzero(by_key_points.inliers) >= weights.min_matches:
         cam_from_world = by_key_points.cam_from_world
-    shown, fit, aligned = around.points_in_view(cam_from_world), None, None
+    shown, found = around.points_in_view(cam_from_world), None
     if len(shown) < weights.min_aligned:
         return None
     templates = asked[0].templates(shown.node_ids)
@@ -131,8 +132,8 @@ def refine_precisely(
         fit = around.fit(aligned, cam_from_world, weights.max_aligned_error_px)
         if fit is None or np.count_nonzero(fit.inliers) < weights.min_aligned:
             return None
-        cam_from_world = fit.cam_from_world
-    return None if fit is None or aligned is None else (fit, aligned)
+        cam_from_world, found = fit.cam_from_world, (fit, aligned)
+    return found
 
 
 def _in_turn(pixels: Float[np.ndarray, "n 2"], camera: Camera) -> Int[np.ndarray, " n"]:
