@@ -240,20 +240,24 @@ def compute_variance_inflation(
     camera: Camera,
     cam_from_world: Rigid3,
     sigma_px: float | Float[np.ndarray, " n"],
+    cells: Int[np.ndarray, " n"] | None = None,
 ) -> float:
     """Return the ratio of the pose's variance to that under independent errors of the inliers. It
     is averaged over the six directions and at least 1.
 
-    If the inliers lie in fewer than six image cells, the ratio is 1.
+    If the inliers lie in fewer than six cells, the ratio is 1.
 
     Args:
         points_img: pixels of the inliers.
         points_world: world points of the inliers (metres).
         point_covariances: covariances of these points (m^2).
         sigma_px: standard deviation of the pixels.
+        cells: the cell of each inlier, within which errors may be shared. None: of the image.
     """
     matches = PoseMatches.from_pixels(points_img, points_world, point_covariances, camera, sigma_px)
-    used, cells = np.unique(cells_of(points_img, camera.width, camera.height), return_inverse=True)
+    if cells is None:
+        cells = cells_of(points_img, camera.width, camera.height)
+    used, cells = np.unique(cells, return_inverse=True)
     if len(used) < _MIN_CELLS:
         return 1.0
     information, gradients = score_gradients(*matches.kernel_args(cam_from_world), CAUCHY_SCALE)

@@ -258,7 +258,7 @@ def _find_consensus(
     TrajectoryError."""
     # Minimum share of the localized images that agree. The session is refused if the share is
     # smaller.
-    min_share, indices = 0.5, list(localized)
+    min_share = 0.5
     if num_queried < MIN_AGREEING:
         many = f"{num_queried} of its pictures are"
         some = many if num_queried > 1 else "one of its pictures is"
@@ -266,19 +266,22 @@ def _find_consensus(
             f"{name}: {some} as far apart as nodes of the map, too few to join: it takes"
             f" {MIN_AGREEING}; no map is changed"
         )
-    if len(indices) < MIN_AGREEING:
+    if len(localized) < MIN_AGREEING:
         raise TrajectoryError(
-            f"{name}: the map recognises {len(indices)} of {num_queried} pictures asked: another"
+            f"{name}: the map recognises {len(localized)} of {num_queried} pictures asked: another"
             " place, or changed; no map is changed"
         )
+    precise = {k: one for k, one in localized.items() if one.position_sigma_m <= SLACK * d_thresh}
+    if len(precise) >= MIN_AGREEING:
+        localized = precise  # the others, such as those far ahead of the map, say nothing of places
     _check_scale(name, odom, localized)
     # Drift of the motion between two agreeing localizations: a share of the distance travelled, and
     # degrees per metre.
     tolerance = MotionTolerance(SLACK * d_thresh, SLACK_DEG, drift=0.03, drift_deg=0.3)
     inlier_idx = find_motion_consensus(odom, localized, tolerance, is_metric=True)
-    if len(inlier_idx) < max(MIN_AGREEING, min_share * len(indices)):
+    if len(inlier_idx) < max(MIN_AGREEING, min_share * len(localized)):
         raise TrajectoryError(
-            f"{name}: of {len(indices)} pictures that the map localizes {len(inlier_idx)} agree"
+            f"{name}: of {len(localized)} pictures that the map localizes {len(inlier_idx)} agree"
             " with its poses; no map is changed"
         )
     return inlier_idx

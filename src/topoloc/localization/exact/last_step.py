@@ -23,6 +23,7 @@ from topoloc.geometry.absolute_pose import (
     refine_absolute_pose,
 )
 from topoloc.geometry.camera import Camera, UncalibratedCamera
+from topoloc.geometry.pose_matches import cells_of
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.localization.answer import Answer, Finding
 from topoloc.localization.exact.appearance import find_shown_points
@@ -80,18 +81,14 @@ def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
         if found is None:
             return None
         fit, aligned = found
-        seen = aligned.select(np.flatnonzero(fit.inliers))
-        parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
-        cam_from_world = fit.cam_from_world
-        inflation = compute_variance_inflation(
-            *parts, first.query.camera, cam_from_world, seen.sigmas_px
-        )
-    noise = inflation**2 * fit.covariance
+        seen, cam_from_world = aligned.select(np.flatnonzero(fit.inliers)), fit.cam_from_world
+        noise = _clustered_noise(fit, seen, first.query.camera)
+        overlap = len(seen) / _num_apart(first, seen, cam_from_world, weights.patch_px)
     before = inverse_covariance(pose.world_from_cam, pose.covariance)
     # the less the nodes contradict each other, the more of their errors average out
     share = min(1.0, weights.shared_error_slope * first.correlated_error_share)
     shared = share * (1.0 - pose.noise_share) * before
-    shared += np.dot(weights.slow_errors, (1.0, 1.0 / len(seen))) * noise
+    shared += max(0.0, weights.overlap_noise * overlap - 1.0) * noise
     facts = {
         "world_from_cam": cam_from_world.inverse(),
         "covariance": inverse_covariance(cam_from_world, noise + shared),
@@ -99,6 +96,40 @@ def refine_answer(query: MapQuery, answer: Answer) -> Finding | None:
     }
     points, text = seen.to_image_scale(first.query.scale), f"refined with {len(seen)} points"
     return Finding("exact pose", text, facts=facts, points=points)
+
+
+def _clustered_noise(
+    fit: AbsolutePose, seen: PreciseMatches, camera: Camera
+) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of a fit, inflated by errors that its inliers share within parts of
+    the area that they cover, which may be a door far ahead."""
+    first, last = np.quantile(seen.points_img, (0.05, 0.95), axis=0)
+    width, height = np.ceil(last - first).astype(int).tolist()
+    inflation = compute_variance_inflation(
+        seen.points_img.astype(np.float64),
+        seen.points_world,
+        seen.covariances,
+        camera,
+        fit.cam_from_world,
+        seen.sigmas_px,
+        cells=cells_of(seen.points_img - first, width + 1, height + 1),
+    )
+    return inflation**2 * fit.covariance
+
+
+def _num_apart(search: Search, seen: PreciseMatches, cam_from_world: Rigid3, patch_px: int) -> int:
+    """Return how many patches lie side by side in the area that these cover. Others overlap them,
+    and their errors are the same.
+
+    If the nodes are farther away than the query, a patch of their images is as much larger in it.
+    """
+    origins = search.templates(seen.node_ids).origins
+    centre = cam_from_world.inverse().translation
+    of_node, of_query = (
+        np.linalg.norm(seen.points_world - one, axis=1) for one in (origins, centre)
+    )
+    size_px = patch_px * max(1.0, float(np.median(of_node / of_query)))
+    return len(np.unique(np.floor(seen.points_img / size_px), axis=0))
 
 
 def refine_precisely(

@@ -42,8 +42,8 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
       rho is `full_growth_share`, and in proportion below.
     - `max_correlated_error_share`: rho of a map above which the step is left out.
     - `shared_error_slope`: times rho, it is the share of the verdict's correlated covariance that
-      remains. `slow_errors` (a, b): errors that vary slowly over the image move the pose and leave
-      no residuals. Their variance is a + b / n times the noise of n aligned matches.
+      remains. `overlap_noise`: patches that overlap have the same errors, so n patches, of which m
+      lie side by side, have this times n / m of the variance that independent ones have.
     """
 
     corpus: str
@@ -68,7 +68,7 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     full_growth_share: Finite
     max_correlated_error_share: Finite
     shared_error_slope: Finite
-    slow_errors: tuple[Finite, Finite]
+    overlap_noise: Finite
 
 
 @cache
