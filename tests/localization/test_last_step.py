@@ -127,7 +127,7 @@ def test_without_images_of_the_nodes_a_pose_is_found_all_the_same(
         monkeypatch.setattr(
             NodeTemplate,
             "of_node",
-            staticmethod(lambda node, jpeg=damaged: read(replace(node, template_image=jpeg))),
+            staticmethod(lambda node, jpeg=damaged: read(replace(node, template=jpeg))),
         )
         trace = Trace()
         result = Localizer(room).localize(image, CAMERA, trace=trace)

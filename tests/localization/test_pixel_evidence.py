@@ -144,7 +144,7 @@ def test_without_images_of_the_nodes_a_refusal_remains(
     monkeypatch.setattr(
         NodeTemplate,
         "of_node",
-        staticmethod(lambda node: read(replace(node, template_image=b""))),
+        staticmethod(lambda node: read(replace(node, template=b""))),
     )
     query, refused = _refused(room, unseen_views(step=0.75)[0][0], -2.0)
     assert weigh_pixels(query, refused) is None

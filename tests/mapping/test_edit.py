@@ -41,7 +41,7 @@ def _without_a_node(path: Path, changes: dict | None = None) -> None:
     with edit_map(path) as edit:
         topomap, gone = edit.topomap, edit.topomap.summaries[-1].node_id
         first, *rest = list(topomap.nodes)[:-1]
-        nodes = [replace(first, template_image=first.template_image + b"\0"), *rest]
+        nodes = [replace(first, template=first.template_image + b"\0"), *rest]
         layers = {
             kind: replace(layer, nodes=nodes if kind == topomap.kind else list(layer.nodes)[:-1])
             for kind, layer in topomap.layers.items()

@@ -81,9 +81,7 @@ def test_an_image_larger_than_its_camera_is_damage_of_its_node(saved: Path, kind
     topomap, file = TopoMetricMap.load(saved), io.BytesIO()
     Pillow.new("L", (10_000, 9_000)).save(file, kind, quality=1)
     *nodes, last = topomap.nodes
-    topomap.with_first_layer(nodes=[*nodes, replace(last, template_image=file.getvalue())]).save(
-        saved
-    )
+    topomap.with_first_layer(nodes=[*nodes, replace(last, template=file.getvalue())]).save(saved)
     fault = f"node {last.summary.node_id} is damaged: its image is 10000x9000, more than 320x240"
     assert find_map_damage(saved) == [fault]
     with TopoMetricMap.load(saved) as damaged, pytest.raises(MapError, match=fault):
@@ -95,7 +93,7 @@ def test_a_stored_image_is_never_turned_beyond_the_size_of_its_camera(saved: Pat
     exif, file = Pillow.Exif(), io.BytesIO()
     exif[ExifTags.Base.Orientation] = 6  # a quarter turn
     Pillow.new("L", (320, 240)).save(file, kind, exif=exif)
-    node = replace(TopoMetricMap.load(saved).nodes[0], template_image=file.getvalue())
+    node = replace(TopoMetricMap.load(saved).nodes[0], template=file.getvalue())
     image = node.read_image()
     assert image is not None
     assert image.shape[:2] == (240, 320)

@@ -160,7 +160,7 @@ def count_seen_points(
     min_cosine = 0.6
     rows, _ = select_visible_points(local_map.points_world, cam_from_world, camera)
     points = local_map.points_world[rows]
-    rays = points - centre, points - cam_from_world.inverse().translation
+    rays = points - centre, points + cam_from_world.translation @ cam_from_world.rotation
     lengths = np.prod([np.linalg.norm(one, axis=1) for one in rays], axis=0)
     return int(np.count_nonzero(np.sum(rays[0] * rays[1], axis=1) > min_cosine * lengths))
 

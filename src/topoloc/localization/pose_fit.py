@@ -40,12 +40,13 @@ class LocalMap:
     def of_node(node: TopoNode) -> LocalMap:
         """Return a node's points in the world frame."""
         world_from_cam = node.summary.world_from_cam
-        lower = np.zeros((len(node.points_cam), 3, 3))
-        lower[:, *np.tril_indices(3)] = node.point_sqrt_covs
-        root = world_from_cam.rotation @ lower
+        rows, columns = np.tril_indices(3)
+        turn = np.zeros((6, 3, 3))  # from the six numbers of L to R @ L
+        turn[np.arange(6), :, columns] = world_from_cam.rotation[:, rows].T
+        root = (node.point_sqrt_covs.astype(np.float64) @ turn.reshape(6, 9)).reshape(-1, 3, 3)
         covariances = root @ root.transpose(0, 2, 1)
         # three sigmas over all directions, plus 1 cm for errors outside the covariance
-        radii = 0.01 + 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        radii = 0.01 + 3.0 * np.sqrt(np.einsum("nii->n", covariances))
         points_world = world_from_cam.apply(node.points_cam.astype(np.float64))
         node_ids, f = np.full(len(radii), node.summary.node_id), node.features
         sizes = f.sizes_px.astype(np.float64) / node.camera.fx * node.points_cam[:, 2]

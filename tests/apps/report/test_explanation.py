@@ -110,7 +110,7 @@ def test_many_pictures_are_too_many(
 
 def test_a_damaged_node_image_is_named(room_map: Path, queries: Path, tmp_path: Path):
     with TopoMetricMap.load(room_map) as topomap:
-        nodes = [replace(node, template_image=b"none") for node in topomap.nodes]
+        nodes = [replace(node, template=b"none") for node in topomap.nodes]
         topomap.with_first_layer(nodes=nodes).save(tmp_path / "damaged.topo")
     page, frame = tmp_path / "why.html", f"{queries}@0"
     assert main(["explain", str(tmp_path / "damaged.topo"), frame, "--out", str(page)]) == 0

@@ -21,7 +21,7 @@ def without_points(node: TopoNode) -> TopoNode:
         features=node.features.select(none),
         points_cam=node.points_cam[none],
         point_sqrt_covs=node.point_sqrt_covs[none],
-        template_image=b"",
+        template=b"",
         stored_descriptors=None,
     )
 

@@ -194,7 +194,7 @@ class TopoNode(OneLine):
     - Row k of `points_cam` (metres, the node's camera frame) is the position of feature k.
     - Row k of `point_sqrt_covs` holds the lower triangular L (xx, yx, yy, zx, zy, zz, in metres) of
       its covariance ``L @ L.T``.
-    - `template_image` is the node's encoded image, possibly smaller than `camera`.
+    - `template` is the node's encoded image, possibly smaller than `camera`, or reads it.
     - `session_statistics` are each session's statistics of the points, if kept.
     - `stored_descriptors` are the descriptors of the file, so that saving writes the same ones.
     """
@@ -204,9 +204,15 @@ class TopoNode(OneLine):
     features: Features
     points_cam: Float32[np.ndarray, "n 3"]
     point_sqrt_covs: Float32[np.ndarray, "n 6"]
-    template_image: bytes
+    template: bytes | Callable[[], bytes]
     session_statistics: Iterable[LandmarkStatistics] = ()
     stored_descriptors: Int8[np.ndarray, "n d"] | None = None
+
+    @property
+    def template_image(self) -> bytes:
+        """Return the node's encoded image, empty if it has none. Raises MapError: it cannot be
+        read."""
+        return self.template if isinstance(self.template, bytes) else self.template()
 
     def read_image(self) -> UInt8[np.ndarray, "h w *rgb"] | None:
         """Return the node's stored image, grey (H, W) or RGB (H, W, 3). None if it has none.
@@ -216,10 +222,8 @@ class TopoNode(OneLine):
         """
         from topoloc.recordings.stored_images import read_stored_image  # it needs OpenCV
 
-        if not self.template_image:
-            return None
-        size = self.camera.width, self.camera.height
-        return read_stored_image(f"node {self.summary.node_id}", self.template_image, size)
+        image, size = self.template_image, (self.camera.width, self.camera.height)
+        return read_stored_image(f"node {self.summary.node_id}", image, size) if image else None
 
 
 @dataclass(frozen=True, eq=False)

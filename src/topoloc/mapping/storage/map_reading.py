@@ -226,12 +226,10 @@ def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: Row
         points = file.row(
             f"{prefix}node_points", f"the points of {what}", node_id=node_id, kind=kind
         )
+        features, points_cam, sqrt_covs, stored = points_from_row(points, kind, file.version, what)
         template, statistics = b"", ()
         if not prefix:
-            found = file.row("node_templates", f"the template of {what}", node_id=node_id)
-            template = found["jpeg"]
-        features, points_cam, sqrt_covs, stored = points_from_row(points, kind, file.version, what)
-        if not prefix:
+            template = _LazyTemplate(file, node_id)
             statistics = _LazyStatistics(file, node_id, kind, sqrt_covs)
         n = len(features)
         if is_default and summary.num_points != n:
@@ -244,6 +242,19 @@ def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: Row
 
 def _read_camera(file: MapFile, camera_id: int) -> Camera:
     return camera_from_text(file.row("cameras", f"camera {camera_id}", camera_id=camera_id)["json"])
+
+
+@dataclass(frozen=True)
+class _LazyTemplate:
+    """Read a node's image when it is called. Only poses that are found need it."""
+
+    file: MapFile
+    node_id: NodeId
+
+    def __call__(self) -> bytes:
+        with self.file.read_connection():
+            what = f"the template of node {self.node_id}"
+            return self.file.row("node_templates", what, node_id=self.node_id)["jpeg"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,7 +121,8 @@ def decompress_array(data: bytes, dtype: str, shape: tuple[int, int], what: str)
 def dequantize_descriptors(stored: Int8[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
     """Return descriptors of length 1 from the file's signed bytes."""
     descriptors = stored.astype(np.float32)
-    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-6)
+    lengths = np.sqrt(np.einsum("nd,nd->n", descriptors, descriptors))  # exact for bytes
+    descriptors /= np.maximum(lengths, np.float32(1e-6))[:, None]
     return descriptors
 
 
