@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -184,6 +185,30 @@ def measure_steps(
             if step is not None:
                 steps[start] = step
     return [steps[start] for start in starts if start in steps]
+
+
+def is_sum_of_short_steps(
+    sequence: StereoSequence, step: MeasuredStep, usable_idx: list[int]
+) -> bool:
+    """Return whether short steps over the frames `usable_idx` between the ends of a step sum up to
+    it, or cannot be measured.
+
+    Where panels of a wall repeat, the images of a long step may show it less a panel.
+    """
+    max_gap = 2  # frames
+    ends = usable_idx.index(step.first), usable_idx.index(step.last)
+    between = range(*ends, max_gap if ends[1] > ends[0] else -max_gap)
+    rows = [usable_idx[k] for k in (*between, ends[1])]
+    if len(rows) < 3 or not step.has_scale:  # directions have no sum
+        return True
+    total, first = Rigid3.identity(), extract_view(sequence[rows[0]])
+    for a, b in pairwise(rows):
+        frame = sequence[b]
+        short = estimate_step(a, b, first, extract_view(frame, is_first=False))
+        if short is None:
+            return True
+        total, first = total @ short.first_from_last, extract_view(frame)
+    return step.normalized_error(total) < 1.0
 
 
 @dataclass(frozen=True, eq=False)

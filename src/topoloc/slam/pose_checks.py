@@ -37,7 +37,12 @@ from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.recordings.trajectory import Trajectory
 from topoloc.slam.calibration_checks import check_calibration
 from topoloc.slam.input_checks import add_calibration
-from topoloc.slam.measured_steps import ROTATION_TOLERANCE, MeasuredStep, measure_steps
+from topoloc.slam.measured_steps import (
+    ROTATION_TOLERANCE,
+    MeasuredStep,
+    is_sum_of_short_steps,
+    measure_steps,
+)
 
 _MIN_INFORMATIVE_STEPS = 5
 # Share of informative steps that agree: accepted poses, and a reported convention.
@@ -114,6 +119,9 @@ def check_poses(sequence: StereoSequence) -> None:
         return
     steps = measure_steps(sequence, posed)
     verdict = evaluate_poses(steps, sequence.poses, sequence.t_ns)
+    if not verdict.is_accepted:
+        steps = [one for one in steps if _is_of_pictures(sequence, one, posed)]
+        verdict = evaluate_poses(steps, sequence.poses, sequence.t_ns)
     _check_order(sequence, steps, verdict)
     check_calibration(sequence, steps, verdict.is_accepted)
     if verdict.is_accepted:
@@ -131,6 +139,14 @@ def check_poses(sequence: StereoSequence) -> None:
     looks = f"they look like poses {described}: --poses {','.join(verdict.conventions)}"
     explained = add_calibration(looks, sequence, verdict.conventions)
     raise TrajectoryError(f"{sequence.name}: {differ}; {explained}")
+
+
+def _is_of_pictures(sequence: StereoSequence, step: MeasuredStep, posed: list[int]) -> bool:
+    """Return whether a step may accuse the poses: those that repeated panels may feign do not."""
+    first, last = sequence.poses[step.first], sequence.poses[step.last]
+    if first is None or last is None or step.normalized_error(first.inverse() @ last) < 1.0:
+        return True
+    return is_sum_of_short_steps(sequence, step, posed)
 
 
 def evaluate_poses(
