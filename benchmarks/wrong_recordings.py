@@ -69,7 +69,7 @@ def run_variant(variant: Variant, data: Path, work: Path, is_check: bool = False
         stack.enter_context(contextlib.redirect_stdout(out))
         stack.enter_context(contextlib.redirect_stderr(error))
         for place in (slam, build) if is_check else ():
-            name = "_track_recording" if place is slam else "build_map"
+            name = "_track_recording" if place is slam else "build_node_map"
             stack.enter_context(mock.patch.object(place, name, end_checks))
         try:
             status = run_topoloc(["build", *arguments])
