@@ -198,3 +198,5 @@ def test_wrong_masks_are_told_in_one_line(
         read_mask(tmp_path / "ones.png")
     with pytest.raises(UnreadableImageError):
         read_mask(tmp_path / "notes.txt")
+    with pytest.raises(CalibrationError, match="one image for all pictures"):
+        read_mask(tmp_path)

@@ -35,10 +35,14 @@ def read_mask(path: str | Path) -> Mask:
 
     Raises:
         UnreadableImageError: the file is no image.
-        CalibrationError: it leaves out every pixel.
+        CalibrationError: it leaves out every pixel, or is a folder.
     """
     from topoloc.recordings.image_io import read_image  # queries without a mask read no file
 
+    if Path(path).is_dir():
+        raise CalibrationError(
+            f"{path}: a mask is one image for all pictures, not a folder; give the image"
+        )
     grey = to_grey(read_image(Path(path)))
     if grey.max() < 128:
         raise CalibrationError(

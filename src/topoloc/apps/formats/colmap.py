@@ -265,7 +265,11 @@ def _find_pose(name: str, sequence: StereoSequence) -> Rigid3:
         row for row, other in enumerate(map(PurePath, names)) if name in (other.name, other.stem)
     ]
     if len(rows) != 1:
-        raise TrajectoryError(f"{sequence.name}: {len(rows)} images are named {name[:80]}")
+        those = ", ".join([names[row] for row in rows] or names)[:120]
+        hint = "give its folder, too" if rows else "take one of these"
+        raise TrajectoryError(
+            f"{sequence.name}: {len(rows)} images are named {name[:80]}; {hint}: {those}"
+        )
     pose = sequence.poses[rows[0]]
     if pose is None:
         raise TrajectoryError(f"{sequence.name}: {name[:80]} has no pose")
