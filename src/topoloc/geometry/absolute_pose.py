@@ -151,7 +151,7 @@ def estimate_absolute_pose(
         else:
             sampling = config.sampling(priorities is not None)
             start, *_ = sample_absolute_pose(undistorted, *solved[1:3], sampling) or (None,)
-    found = start and matches.fit(start, camera, *config.inlier_limits, num_rounds)
+    found = start and matches.fit(start, *config.inlier_limits, num_rounds)
     return found and _pose_of_all(found, order, len(points_img))
 
 
@@ -181,7 +181,7 @@ def refine_absolute_pose(
         normalized[rows],
     )
     # a second round changes nothing: the loss is robust, and the start is near
-    found = matches.fit(start, camera, max_error_px, num_rounds=1, min_noise_scale=0.1)
+    found = matches.fit(start, max_error_px, num_rounds=1, min_noise_scale=0.1)
     return found and _pose_of_all(found, rows, len(points_img))
 
 
@@ -225,14 +225,6 @@ def _solve_with_opencv(
     return Rigid3(cv2.Rodrigues(rotation)[0], translation[:, 0].copy())
 
 
-def select_inliers(
-    cam_from_world: Rigid3, matches: PoseMatches, camera: Camera, config: AbsolutePoseConfig
-) -> Bool[np.ndarray, " n"]:
-    """Return the inliers of a pose. With poselib the threshold is widened for uncertain points."""
-    arguments = matches.kernel_args(cam_from_world)
-    return matches.select_inliers(arguments, camera, *config.inlier_limits)
-
-
 def compute_variance_inflation(
     points_img: Float[np.ndarray, "n 2"],
     points_world: Float[np.ndarray, "n 3"],
@@ -268,8 +260,7 @@ def compute_variance_inflation(
     # The pose is fitted to the same matches, which makes the sums smaller.
     fit_correction = len(used) / (len(used) - 3.0)
     gradients -= gradients.mean(axis=0)
-    clustered = np.zeros((len(used), 6))
-    np.add.at(clustered, cells, gradients)
+    clustered = np.column_stack([np.bincount(cells, column) for column in gradients.T])
     variance_alone, variance_together = (
         np.trace(np.linalg.solve(information, each.T @ each)) for each in (gradients, clustered)
     )

@@ -20,7 +20,6 @@ from topoloc.geometry.absolute_pose import (
     AbsolutePose,
     AbsolutePoseConfig,
     estimate_absolute_pose,
-    select_inliers,
 )
 from topoloc.geometry.camera import Camera, UncalibratedCamera
 from topoloc.geometry.joint_camera.camera_hypotheses import (
@@ -239,8 +238,9 @@ def _refine_pose_and_focal(
     loss, worst = math.inf, (config.max_reprojection_error_px / config.key_point_sigma_px) ** 2
     for _ in range(_MAX_ROUNDS):
         matches = PoseMatches.from_pixels(*finite, camera, config.key_point_sigma_px)
-        inliers = select_inliers(cam_from_world, matches, camera, config)
-        squares = np.where(inliers, squared_errors(*matches.kernel_args(cam_from_world)), worst)
+        arguments = matches.kernel_args(cam_from_world)
+        inliers = matches.select_inliers(arguments, *config.inlier_limits)
+        squares = np.where(inliers, squared_errors(*arguments)[1], worst)
         loss = float(np.log1p(squares / CAUCHY_SCALE**2).sum())
         if not is_non_collinear(matches.points_world[inliers]):
             return None

@@ -3,6 +3,7 @@ covariance. Each kernel passes over the matches once, without an allocation per 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,13 +51,14 @@ class PoseMatches:
         `normalized` are the pixels on the plane z = 1, if known."""
         if normalized is None:
             normalized = camera.normalized_from_img(points_img)
-        sigmas = np.asarray(sigma_px)[..., None, None]
-        to_normalized = sigmas * camera.normalized_jacobian(normalized)
+        a, b, c, d = camera.normalized_jacobian(normalized).reshape(-1, 4).T
+        products = np.stack([a * a + b * b, a * c + b * d, a * c + b * d, c * c + d * d], axis=1)
+        variances = np.square(sigma_px)[..., None]
         return PoseMatches(
             sigma_px,
             points_img=np.ascontiguousarray(points_img, dtype=np.float64),
             normalized=normalized,
-            covariances=to_normalized @ to_normalized.transpose(0, 2, 1),
+            covariances=(variances * products).reshape(-1, 2, 2),
             points_world=np.ascontiguousarray(points_world, dtype=np.float64),
             point_covariances=np.ascontiguousarray(covariances, dtype=np.float64),
         )
@@ -77,31 +79,24 @@ class PoseMatches:
         return is_non_collinear(self.points_world) and is_non_collinear(self.normalized)
 
     def select_inliers(
-        self,
-        kernel_args: tuple[_Array, ...],
-        camera: Camera,
-        max_error_px: float,
-        max_scale: float = 1.0,
+        self, kernel_args: tuple[_Array, ...], max_error_px: float, max_scale: float = 1.0
     ) -> Bool[np.ndarray, " n"]:
         """Return the matches with a reprojection error of at most `max_error_px`. For uncertain
         points this limit is widened up to `max_scale` times, in proportion to the standard
         deviation that they add to `sigma_px`.
 
         A plain limit would truncate the errors of uncertain points, and the rest would look too
-        precise. Points behind the camera or outside its field are no inliers.
+        precise. Points behind the camera are no inliers.
         """
-        rotation, translation, *_ = kernel_args
-        projected = camera.img_from_cam(self.points_world @ rotation.T + translation)
-        errors_px = np.linalg.norm(projected - self.points_img, axis=1)
+        limits = np.square(max_error_px / np.asarray(self.sigma_px))
+        of_pixels, squares = squared_errors(*kernel_args)
         if max_scale == 1.0 or len(self.point_covariances) == 0:
-            return errors_px <= max_error_px
-        is_likely = squared_errors(*kernel_args) <= (max_error_px / self.sigma_px) ** 2
-        return is_likely & (errors_px <= max_scale * max_error_px)
+            return of_pixels <= limits
+        return (squares <= limits) & (of_pixels <= max_scale**2 * limits)
 
     def fit(
         self,
         start: Rigid3,
-        camera: Camera,
         max_error_px: float,
         max_scale: float = 1.0,
         num_rounds: int = 2,
@@ -114,8 +109,8 @@ class PoseMatches:
         """
         pose, inliers = self.kernel_args(start), np.zeros(0, np.bool_)
         for number in range(num_rounds + 1):
-            inliers = self.select_inliers(pose, camera, max_error_px, max_scale)
-            if not is_non_collinear(self.points_world[inliers]):
+            inliers = self.select_inliers(pose, max_error_px, max_scale)
+            if not has_spread(self.points_world, inliers):
                 return None
             if number < num_rounds:
                 pose = (*run_gauss_newton(*pose, inliers, CAUCHY_SCALE, 10), *pose[2:])
@@ -133,13 +128,7 @@ def refine_pose(
 
 def is_non_collinear(points: Float[np.ndarray, "n d"]) -> bool:
     """Return whether there are at least four points, not all on one line."""
-    if len(points) < MIN_POINTS:
-        return False
-    centred = points - points.mean(axis=0)
-    scatter = centred.T @ centred
-    # Of variances a <= b <= c, trace^2 - |scatter|^2 is 2 (ab + ac + bc), between 2 bc and 6 bc.
-    total = float(np.trace(scatter)) ** 2
-    return total - float(np.vdot(scatter, scatter)) > 2e-9 * total
+    return has_spread(points, np.ones(len(points), np.bool_))
 
 
 def _estimate_covariance(
@@ -147,7 +136,7 @@ def _estimate_covariance(
 ) -> Float[np.ndarray, "6 6"] | None:
     """Return the covariance of a pose that was fitted to the active matches. None if they do not
     fix the pose."""
-    scale = estimate_noise_scale(squared_errors(*kernel_args)[active], 6, min_noise_scale)
+    scale = estimate_noise_scale(squared_errors(*kernel_args)[1][active], 6, min_noise_scale)
     information, *_ = normal_equations(*kernel_args, active, CAUCHY_SCALE * scale, 6)
     diagonal = np.sqrt(np.diag(information))
     if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
@@ -167,15 +156,8 @@ def estimate_noise_scale(
 
     It is at least `least`. If few matches fit well, this is due to chance or to the fit itself.
     """
-    num_free, variance = max(2 * len(squares) - num_unknowns, 1), 1.0
-    for _ in range(_MAX_SCALE_STEPS):
-        scaled = squares / variance
-        total = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2)))
-        better = max(least**2, variance * total / (_MEAN_WEIGHTED_SQUARE * num_free))
-        if abs(better / variance - 1.0) <= 0.001:
-            break
-        variance = better
-    return float(np.sqrt(variance))
+    num_free = max(2 * len(squares) - num_unknowns, 1)
+    return math.sqrt(_fit_variance(squares, num_free, least**2))
 
 
 def cells_of(
@@ -188,6 +170,44 @@ def cells_of(
 
 
 @kernel()
+def has_spread(points, active):
+    """Return whether there are at least four active points, not all on one line."""
+    number, size = 0, points.shape[1]
+    mean, scatter = np.zeros(size), np.zeros((size, size))
+    for i in range(len(points)):
+        if active[i]:
+            number += 1
+            for a in range(size):
+                mean[a] += points[i, a]
+    if number < MIN_POINTS:
+        return False
+    mean /= number
+    for i in range(len(points)):
+        if active[i]:
+            for a in range(size):
+                for b in range(size):
+                    scatter[a, b] += (points[i, a] - mean[a]) * (points[i, b] - mean[b])
+    # Of variances a <= b <= c, trace^2 - |scatter|^2 is 2 (ab + ac + bc), between 2 bc and 6 bc.
+    total = np.trace(scatter) ** 2
+    return total - np.sum(scatter * scatter) > 2e-9 * total
+
+
+@kernel(error_model="numpy")
+def _fit_variance(squares, num_free, least):
+    """Return the variance of `estimate_noise_scale`."""
+    variance = 1.0
+    for _ in range(_MAX_SCALE_STEPS):
+        total = 0.0
+        for square in squares:
+            total += square / (variance + square / CAUCHY_SCALE**2)
+        better = max(least, variance * total / (_MEAN_WEIGHTED_SQUARE * num_free))
+        if abs(better / variance - 1.0) <= 0.001:
+            break
+        variance = better
+    return variance
+
+
+@kernel(error_model="numpy", inline="always")
 def _whiten_residual(
     rotation, translation, normalized, covariances, points_world, point_covariances, i
 ):
@@ -236,19 +256,22 @@ def _whiten_residual(
     return u, v, w, e0, e1, i00, i01, i11, e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
 
 
-@kernel()
+@kernel(error_model="numpy")
 def squared_errors(rotation, translation, normalized, covariances, points_world, point_covariances):
-    """Return the squared Mahalanobis length of each match's reprojection error, infinite for points
-    behind the camera."""
-    squares = np.empty(len(normalized))
+    """Return the squared Mahalanobis length of each match's reprojection error, without and with
+    the uncertainty of its point, infinite for points behind the camera."""
+    of_pixels, squares = np.full(len(normalized), np.inf), np.empty(len(normalized))
     for i in range(len(normalized)):
-        squares[i] = _whiten_residual(
+        _, _, _, x, y, _, _, _, squares[i] = _whiten_residual(
             rotation, translation, normalized, covariances, points_world, point_covariances, i
-        )[8]
-    return squares
+        )
+        if squares[i] < np.inf:
+            a, b, d = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
+            of_pixels[i] = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return of_pixels, squares
 
 
-@kernel()
+@kernel(error_model="numpy")
 def normal_equations(
     rotation, translation, normalized, covariances, points_world, point_covariances,
     active, cauchy_scale, num_unknowns,
@@ -268,7 +291,7 @@ def normal_equations(
     of the weighted squared residuals.
     """
     information, gradient = np.zeros((num_unknowns, num_unknowns)), np.zeros(num_unknowns)
-    cost, squares = 0.0, 0.0
+    cost, squares, product = 0.0, 0.0, 1.0
     jacobian = np.zeros((2, 7))
     for i in range(len(normalized)):
         if not active[i]:
@@ -280,7 +303,10 @@ def normal_equations(
             cost += 1e6  # so that a step that puts a match behind the camera is rejected
             continue
         weight = 1.0 / (1.0 + squared / cauchy_scale**2)
-        cost += 0.5 * cauchy_scale**2 * np.log1p(squared / cauchy_scale**2)
+        product *= weight  # a logarithm of many is quicker than many logarithms
+        if product < 1e-200:
+            cost -= 0.5 * cauchy_scale**2 * np.log(product)
+            product = 1.0
         squares += weight * squared
         # Rows of D [I, -[p]x] with p = (x, y, z), D = [[w, 0, -u w], [0, w, -v w]].
         jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = w, 0.0, -u * w
@@ -294,6 +320,7 @@ def normal_equations(
             gradient[a] += p0 * e0 + p1 * e1
             for b in range(a, num_unknowns):
                 information[a, b] += p0 * jacobian[0, b] + p1 * jacobian[1, b]
+    cost -= 0.5 * cauchy_scale**2 * np.log(product)
     for a in range(num_unknowns):
         for b in range(a):
             information[a, b] = information[b, a]

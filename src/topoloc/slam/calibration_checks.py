@@ -175,7 +175,7 @@ def _cost(points: MatchedPoints, stretch: Float[np.ndarray, "#n #3"], factor: fl
     if pose is None:
         return math.inf
     matches = PoseMatches.from_pixels(pixels, *stretched, camera, 1.0)
-    squares = squared_errors(*matches.kernel_args(pose.cam_from_world))
+    _, squares = squared_errors(*matches.kernel_args(pose.cam_from_world))
     squares = squares[np.isfinite(squares)]  # points in front of the camera
     return float(cauchy_square * np.log1p(squares / cauchy_square).sum())
 

@@ -184,7 +184,9 @@ def find_shown_points(
     numbers = np.bincount(part, minlength=int(counts.prod()))
     thin_share = 0.2  # nearer points belong to thin things
     ranks = np.cumsum(numbers) - numbers + (thin_share * numbers).astype(int)
-    return depths <= weights.max_depth * depths[np.lexsort((depths, part))[ranks[part]]]
+    farthest = 2.0 * depths.max(initial=1e-9)
+    nearer = (np.sort(part + depths / farthest)[ranks[part]] - part) * farthest
+    return depths <= weights.max_depth * nearer
 
 
 def _correlate(

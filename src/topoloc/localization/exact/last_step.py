@@ -129,7 +129,8 @@ def _num_apart(search: Search, seen: PreciseMatches, cam_from_world: Rigid3, pat
         np.linalg.norm(seen.points_world - one, axis=1) for one in (origins, centre)
     )
     size_px = patch_px * max(1.0, float(np.median(of_node / of_query)))
-    return len(np.unique(np.floor(seen.points_img / size_px), axis=0))
+    columns, rows = np.floor(seen.points_img / size_px).astype(np.int64).T
+    return len(np.unique(rows * 100_000 + columns))
 
 
 def refine_precisely(
@@ -171,10 +172,10 @@ def _in_turn(pixels: Float[np.ndarray, "n 2"], camera: Camera) -> Int[np.ndarray
     """Return the rows of pixels in turn: the first one of each image cell, then the second."""
     num_columns = 16
     columns, rows = (pixels / (camera.width / num_columns)).astype(np.int64).T
-    cells = rows * num_columns + columns
-    order = np.argsort(cells, kind="stable")
-    rank = np.arange(len(order)) - np.searchsorted(cells[order], cells[order])
-    return order[np.lexsort((order, rank))]
+    cells = (rows * num_columns + columns).astype(np.int16)  # sorted by digits, which is quicker
+    order, ranks = np.argsort(cells, kind="stable"), np.empty(len(cells), np.int16)
+    ranks[order] = np.arange(len(order)) - np.searchsorted(cells[order], cells[order])
+    return np.argsort(ranks, kind="stable")
 
 
 @dataclass(frozen=True, eq=False)

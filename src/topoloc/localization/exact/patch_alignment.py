@@ -119,7 +119,7 @@ def align(
     """
     view = predict_patches(points.points_world, templates, cam_from_world, camera)
     pixels, correlations, bends = correlate(image, view, reach_px, weights)
-    bend, directions = np.linalg.eigh(bends)  # ascending: first along the edge
+    bend, along_edge = _bends_along_edges(bends)
     noise = weights.variance * (1.02 - correlations[:, None])  # of the query, even if alike
     variances = noise / np.maximum(bend, 1e-5) + weights.least_sigma_px**2
     away = np.linalg.norm(templates.origins - cam_from_world.inverse().translation, axis=1)
@@ -129,12 +129,12 @@ def align(
     rows = np.flatnonzero(is_kept & (variances[:, 1] < weights.max_sigma_px**2))
     found, rays = points.select(rows), (points.points_world - templates.origins)[rows]
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    along = np.einsum("ni,nij,nj->n", rays, found.covariances, rays)
+    along = ((found.covariances @ rays[:, :, None])[:, :, 0] * rays).sum(axis=1)
     covariances = along[:, None, None] * rays[:, :, None] * rays[:, None, :]
     wide, narrow = variances[rows].T
     depths = cam_from_world.apply(found.points_world)[:, 2]
     edge_px = np.sqrt(np.minimum(wide - narrow, weights.max_edge_sigma_px**2))
-    edges = directions[rows, :, 0] @ cam_from_world.rotation[:2]
+    edges = along_edge[rows] @ cam_from_world.rotation[:2]
     edges *= (edge_px * depths / camera.fx)[:, None]
     covariances += edges[:, :, None] * edges[:, None, :]
     return replace(
@@ -143,6 +143,18 @@ def align(
         sigmas_px=np.sqrt(narrow),
         covariances=covariances,
     )
+
+
+def _bends_along_edges(
+    bends: Float[np.ndarray, "n 2 2"],
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """Return the second derivatives along and across the edge in each patch, and the unit vector
+    along it: the eigenvalues, ascending, and the first eigenvector."""
+    a, b, d = bends[:, 0, 0], bends[:, 0, 1], bends[:, 1, 1]
+    middle, radius = (a + d) / 2.0, np.hypot((a - d) / 2.0, b)
+    angle = np.arctan2(2.0 * b, a - d) / 2.0  # of the direction across the edge
+    directions = np.column_stack([-np.sin(angle), np.cos(angle)])
+    return np.column_stack([middle - radius, middle + radius]), directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,15 +180,17 @@ def predict_patches(
     """Return the patches of points."""
     in_query, in_node = cam_from_world.apply(points_world), templates.in_nodes(points_world)
     # short enough for the derivative of any lens
-    steps = 0.01 * in_node[:, 2:] * np.eye(3)[:2, None]
-    turned = np.einsum("ij,njk,lnk->lni", cam_from_world.rotation, templates.rotations, steps)
-    queried = np.stack([in_query, *(in_query + turned)])
+    lengths = 0.01 * in_node[:, 2:]
+    turned = templates.turned_by(cam_from_world.rotation)
+    queried = np.stack([in_query, *(in_query + lengths * turned[:, :, i] for i in range(2))])
+    steps = np.stack([in_node, *(in_node + lengths * axis for axis in np.eye(3)[:2])])
     predicted, *by_query = camera.img_from_cam(queried.reshape(-1, 3)).reshape(3, -1, 2)
-    centres, *by_node = templates.project(np.stack([in_node, *(in_node + steps)]))
+    centres, *by_node = templates.project(steps)
     (a, c), (b, d) = ((moved - predicted).T for moved in by_query)
+    (e, g), (f, h) = ((moved - centres).T for moved in by_node)
     with np.errstate(divide="ignore", invalid="ignore"):  # a plane seen from its edge
-        inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
-    warps = np.einsum("jni,jkn->nik", by_node - centres, inverse)
+        products = np.stack([e * d - f * c, f * a - e * b, g * d - h * c, h * a - g * b])
+        warps = (products / (a * d - b * c)).T.reshape(-1, 2, 2)
     return PredictedPatches(templates, predicted, centres, warps)
 
 

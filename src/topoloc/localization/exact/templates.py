@@ -62,8 +62,16 @@ def sample_colours(
     colours: Float[np.ndarray, "rows columns 3"], places: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 3"]:
     """Return the colours at places, which are pixels over the image size."""
-    x, y = (places * colours.shape[1::-1] - 0.5).astype(np.float32).T[:, :, None]
-    sampled = cv2.remap(colours, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return _interpolate(colours, *(places * colours.shape[1::-1] - 0.5).T)
+
+
+def _interpolate(
+    colours: Float[np.ndarray, "rows columns 3"],
+    x: Float[np.ndarray, " n"],
+    y: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    pixels = x.astype(np.float32), y.astype(np.float32)
+    sampled = cv2.remap(colours, *pixels, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return sampled.reshape(-1, 3).astype(np.float64)
 
 
@@ -87,10 +95,11 @@ class PointTemplates:
     templates: NodeTemplates
     of_point: Int[np.ndarray, " n"]
 
-    @property
-    def rotations(self) -> Float[np.ndarray, "n 3 3"]:
-        """Return the rotation of world_from_cam of the node of each point."""
-        return np.array([one.world_from_cam.rotation for one in self.templates])[self.of_point]
+    def turned_by(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3 3"]:
+        """Return the product of a rotation with that of world_from_cam of the node of each
+        point."""
+        turned = rotation @ np.array([one.world_from_cam.rotation for one in self.templates])
+        return turned[self.of_point]
 
     @property
     def origins(self) -> Float[np.ndarray, "n 3"]:
@@ -99,11 +108,19 @@ class PointTemplates:
 
     def in_nodes(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return points in the camera frames of their nodes, metres."""
-        return np.einsum("nji,nj->ni", self.rotations, points_world - self.origins)
+        # one product with all rotations is quicker than one of each point
+        turned = points_world @ np.hstack([one.world_from_cam.rotation for one in self.templates])
+        shifts = [one.world_from_cam.inverse().translation for one in self.templates]
+        rows = np.arange(len(points_world))
+        return (
+            turned.reshape(len(rows), -1, 3)[rows, self.of_point] + np.array(shifts)[self.of_point]
+        )
 
     def project(self, in_nodes: Float[np.ndarray, "k n 3"]) -> Float[np.ndarray, "k n 2"]:
         """Return the pixels of k positions of each point, given in the frame of its node."""
         pixels, cameras = np.empty((*in_nodes.shape[:2], 2)), [one.camera for one in self.templates]
+        if len(set(cameras)) == 1:
+            return cameras[0].img_from_cam(in_nodes.reshape(-1, 3)).reshape(pixels.shape)
         for camera in set(cameras):
             rows = np.flatnonzero(np.array([one == camera for one in cameras])[self.of_point])
             projected = camera.img_from_cam(in_nodes[:, rows].reshape(-1, 3))
@@ -113,10 +130,18 @@ class PointTemplates:
     def sample_colours(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the `small_colours` of points in the images of their nodes, NaN where grey."""
         pixels = self.project(self.in_nodes(points_world)[None])[0]
-        colours = np.full(points_world.shape, np.nan)
-        for k, template in enumerate(self.templates):
-            rows = np.flatnonzero(self.of_point == k)
-            if template.colours is not None:
-                size = [template.camera.width, template.camera.height]
-                colours[rows] = sample_colours(template.colours, pixels[rows] / size)
+        sizes = np.array([(one.camera.width, one.camera.height) for one in self.templates])
+        heights = np.array(
+            [0 if one.colours is None else len(one.colours) for one in self.templates]
+        )
+        colours, known = np.full(points_world.shape, np.nan), heights[self.of_point] > 0
+        if not known.any():
+            return colours
+        # small images one below the other
+        image = np.vstack([one.colours for one in self.templates if one.colours is not None])
+        of_point, num_columns = self.of_point[known], image.shape[1]
+        x, y = (pixels[known] / sizes[of_point]).T
+        rows = np.clip(y * heights[of_point] - 0.5, 0.0, heights[of_point] - 1.0)
+        rows += (np.cumsum(heights) - heights)[of_point]
+        colours[known] = _interpolate(image, x * num_columns - 0.5, rows)
         return colours
