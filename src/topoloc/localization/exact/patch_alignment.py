@@ -222,10 +222,9 @@ def correlate(
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
-def _sample_patch(template, size, x, y, warp, patch):
-    """Write the template around (x, y), warped to the query, into `patch`, with zero mean. Return
-    the sum of its squares, 0 if it leaves the template."""
-    side = len(patch)
+def _sample_patch(template, size, x, y, warp, patch, side):
+    """Write the template around (x, y), warped to the query, into the first `side` rows and columns
+    of `patch`, with zero mean. Return the sum of its squares, 0 if it leaves the template."""
     half, mean, squares, one = side // 2, np.float32(0.0), np.float32(0.0), np.float32(1.0)
     reach_x = half * (abs(warp[0, 0]) + abs(warp[0, 1]))
     reach_y = half * (abs(warp[1, 0]) + abs(warp[1, 1]))
@@ -236,10 +235,11 @@ def _sample_patch(template, size, x, y, warp, patch):
         for i in range(side):
             px = x + warp[0, 0] * (i - half) + warp[0, 1] * (j - half)
             py = y + warp[1, 0] * (i - half) + warp[1, 1] * (j - half)
-            x0, y0 = int(px), int(py)
+            x0, y0 = np.uint32(px), np.uint32(py)  # Numba looks for negative indices else
+            x1, y1 = x0 + np.uint32(1), y0 + np.uint32(1)
             fx, fy = np.float32(px - x0), np.float32(py - y0)
-            upper = (one - fx) * template[y0, x0] + fx * template[y0, x0 + 1]
-            lower = (one - fx) * template[y0 + 1, x0] + fx * template[y0 + 1, x0 + 1]
+            upper = (one - fx) * template[y0, x0] + fx * template[y0, x1]
+            lower = (one - fx) * template[y1, x0] + fx * template[y1, x1]
             patch[j, i] = (one - fy) * upper + fy * lower
             mean += patch[j, i]
     mean /= np.float32(side * side)
@@ -251,24 +251,19 @@ def _sample_patch(template, size, x, y, warp, patch):
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
-def _correlate(patch, patch_squares, window, min_squares, scratch, scores):
+def _correlate(patch, side, patch_squares, window, min_squares, scratch, scores):
     """Write the correlation of the patch with the window at each shift into `scores`, -1 without
-    texture. Rows of the patch are padded by zeros to a multiple of four, the window by a row.
-    `scratch` holds three arrays of the window's shape."""
-    side, width, shifts = len(patch), window.shape[1], len(scores)
-    products, sums, squares = scratch[0], scratch[1], scratch[2]
-    # four pixels of the patch with those of all shifts: the compiler vectorizes loops over slices
-    flat, count = window.reshape(-1), (shifts - 1) * width + shifts
-    total = products.reshape(-1)[:count]
-    total[:] = 0.0
-    for j in range(side):
-        for i in range(0, patch.shape[1], 4):
-            a, b, c, d = patch[j, i], patch[j, i + 1], patch[j, i + 2], patch[j, i + 3]
-            first = j * width + i
-            p, q = flat[first : first + count], flat[first + 1 : first + 1 + count]
-            r, s = flat[first + 2 : first + 2 + count], flat[first + 3 : first + 3 + count]
-            for k in range(count):
-                total[k] += a * p[k] + b * q[k] + c * r[k] + d * s[k]
+    texture. The patch has the window's width and is padded by zeros, so that its pixels are as far
+    apart as the window's. `scratch` holds two arrays of the window's shape."""
+    width, shifts, length = window.shape[1], len(scores), patch.size
+    sums, squares = scratch[0], scratch[1]
+    of_patch, of_window = patch.reshape(-1), window.reshape(-1)
+    for j in range(shifts):
+        for i in range(shifts):
+            moved, total = of_window[j * width + i :][:length], np.float32(0.0)
+            for k in range(length):
+                total += of_patch[k] * moved[k]
+            scores[j, i] = total
     sums[0] = 0.0
     squares[0] = 0.0
     for j in range(side + shifts - 1):
@@ -283,9 +278,8 @@ def _correlate(patch, patch_squares, window, min_squares, scratch, scores):
         level, square = np.sum(sums[j, :side]), np.sum(squares[j, :side])
         for i in range(shifts):
             spread = square - level * level / np.float32(side * side)
-            scores[j, i] = -1.0
-            if spread > min_squares:
-                scores[j, i] = products[j, i] / np.sqrt(patch_squares * spread)
+            is_textured = spread > min_squares
+            scores[j, i] = scores[j, i] / np.sqrt(patch_squares * spread) if is_textured else -1.0
             if i + 1 < shifts:
                 level += sums[j, i + side] - sums[j, i]
                 square += squares[j, i + side] - squares[j, i]
@@ -336,11 +330,12 @@ def align_patches(
     """
     pixels, correlations = np.full((len(predicted), 2), np.nan), np.full(len(predicted), np.nan)
     bends = np.zeros((len(predicted), 2, 2))
-    patch = np.zeros((patch_px, -(-patch_px // 4) * 4), np.float32)
     scores = np.zeros((2 * reach_px + 1, 2 * reach_px + 1), np.float32)
     margin, last = patch_px // 2 + reach_px, 2 * reach_px
-    window = np.zeros((2 * margin + 2, 2 * margin + 1), np.float32)
-    scratch = np.zeros((3, *window.shape), np.float32)
+    width = -(-(2 * margin + 1) // 8) * 8  # rows of whole vectors
+    patch = np.zeros((-(-patch_px // 4) * 4, width), np.float32)
+    window = np.zeros((len(patch) + last + 1, width), np.float32)
+    scratch = np.zeros((2, *window.shape), np.float32)
     min_squares = np.float32(min_sigma**2 * patch_px**2)
     for k in range(len(predicted)):
         if not (np.isfinite(predicted[k, 0]) and np.isfinite(warps[k, 0, 0])):
@@ -350,15 +345,16 @@ def align_patches(
             continue
         row = template_of_match[k]
         contrast = _sample_patch(
-            templates[row], sizes[row], centres[k, 0], centres[k, 1], warps[k], patch
+            templates[row], sizes[row], centres[k, 0], centres[k, 1], warps[k], patch, patch_px
         )
         if contrast < min_squares:
             continue
         level = np.float32(image[y, x])  # of small numbers float32 keeps more digits
         for j in range(2 * margin + 1):
+            pixels_of_row = image[y - margin + j, x - margin : x + margin + 1]
             for i in range(2 * margin + 1):
-                window[j, i] = np.float32(image[y - margin + j, x - margin + i]) - level
-        _correlate(patch, contrast, window, min_squares, scratch, scores)
+                window[j, i] = np.float32(pixels_of_row[i]) - level
+        _correlate(patch, patch_px, contrast, window, min_squares, scratch, scores)
         best = np.argmax(scores)
         j, i = best // (last + 1), best % (last + 1)
         correlations[k] = -1.0
