@@ -3,7 +3,6 @@ covariance. Each kernel passes over the matches once, without an allocation per 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,16 +11,14 @@ from jaxtyping import Bool, Float, Int
 from topoloc.compiled import kernel
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.robust_variance import CAUCHY_SCALE, estimate_noise_scale
 
 _COLUMNS, _ROWS = 8, 6
 _Array = np.ndarray
 MIN_POINTS = 4
-CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
-_MAX_SCALE_STEPS = 30
 # Effect of Cauchy's weights w on Gaussian residuals r of two dimensions, to correct the covariance
-# for it: E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance
-# over the inverse of its information.
-_MEAN_WEIGHTED_SQUARE = 0.6302
+# for it: E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance over the inverse
+# of its information.
 _ESTIMATOR_VARIANCE = 0.8265
 
 
@@ -148,18 +145,6 @@ def _estimate_covariance(
     return _ESTIMATOR_VARIANCE * scale**2 * ((inverse + inverse.T) / 2.0)
 
 
-def estimate_noise_scale(
-    squares: Float[np.ndarray, " n"], num_unknowns: int, least: float = 1.0
-) -> float:
-    """Return the factor by which the noise exceeds its assumed standard deviation, from squared
-    whitened residuals of a fit of some unknowns (Huber's proposal 2, 1964).
-
-    It is at least `least`. If few matches fit well, this is due to chance or to the fit itself.
-    """
-    num_free = max(2 * len(squares) - num_unknowns, 1)
-    return math.sqrt(_fit_variance(squares, num_free, least**2))
-
-
 def cells_of(
     points_img: Float[np.ndarray, "n 2"], width: int, height: int
 ) -> Int[np.ndarray, " n"]:
@@ -190,21 +175,6 @@ def has_spread(points, active):
     # Of variances a <= b <= c, trace^2 - |scatter|^2 is 2 (ab + ac + bc), between 2 bc and 6 bc.
     total = np.trace(scatter) ** 2
     return total - np.sum(scatter * scatter) > 2e-9 * total
-
-
-@kernel(error_model="numpy")
-def _fit_variance(squares, num_free, least):
-    """Return the variance of `estimate_noise_scale`."""
-    variance = 1.0
-    for _ in range(_MAX_SCALE_STEPS):
-        total = 0.0
-        for square in squares:
-            total += square / (variance + square / CAUCHY_SCALE**2)
-        better = max(least, variance * total / (_MEAN_WEIGHTED_SQUARE * num_free))
-        if abs(better / variance - 1.0) <= 0.001:
-            break
-        variance = better
-    return variance
 
 
 @kernel(error_model="numpy", inline="always")
