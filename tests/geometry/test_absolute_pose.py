@@ -13,6 +13,7 @@ from topoloc.geometry.absolute_pose import (
 )
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_matches import PoseMatches
 from topoloc.geometry.rig import depth_sigmas, ray_covariances
 from topoloc.geometry.rigid import Rigid3, inverse_covariance, position_covariance
 
@@ -107,6 +108,20 @@ def test_outliers_are_distinguished_from_inliers(method, outliers):
     assert pose.inliers[: scene.num_outliers].mean() < 0.02
     assert translation_error(pose.cam_from_world, scene.cam_from_world) < 0.03
     assert np.array_equal(pose.inliers, _errors_px(pose, scene, CAMERAS["OPENCV"]) <= 4.0)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_inliers_are_near_the_projections_of_their_points(model):
+    rng, camera, limit = np.random.default_rng(4), CAMERAS[model], 4.0
+    scene = make_scene(rng, camera, n=2000)
+    wrong = Rigid3.exp(rng.normal(0.0, 0.01, 6)) @ scene.cam_from_world
+    exact = np.zeros((0, 3, 3))
+    matches = PoseMatches.from_pixels(scene.points_img, scene.points_world, exact, camera, 0.7)
+    inliers = matches.select_inliers(matches.kernel_args(wrong), limit)
+    projected = camera.img_from_cam(wrong.apply(scene.points_world))
+    errors_px = np.nan_to_num(np.linalg.norm(projected - scene.points_img, axis=1), nan=np.inf)
+    assert inliers[errors_px < 0.9 * limit].all() and not inliers[errors_px > 1.1 * limit].any()
+    assert 100 < np.count_nonzero(inliers) < 1900
 
 
 def test_priorities_lead_to_a_pose_among_very_many_outliers():

@@ -38,9 +38,9 @@ from topoloc.geometry.joint_camera.joint_fit import (
 from topoloc.geometry.pose_matches import (
     CAUCHY_SCALE,
     PoseMatches,
-    is_non_collinear,
+    has_spread,
     normal_equations,
-    refine_pose,
+    run_gauss_newton,
     solve_cholesky,
     squared_errors,
 )
@@ -242,9 +242,9 @@ def _refine_pose_and_focal(
         inliers = matches.select_inliers(arguments, *config.inlier_limits)
         squares = np.where(inliers, squared_errors(*arguments)[1], worst)
         loss = float(np.log1p(squares / CAUCHY_SCALE**2).sum())
-        if not is_non_collinear(matches.points_world[inliers]):
+        if not has_spread(matches.points_world, inliers):
             return None
-        cam_from_world = refine_pose(cam_from_world, matches, inliers)
+        cam_from_world = Rigid3(*run_gauss_newton(*arguments, inliers, CAUCHY_SCALE, 10))
         arguments = matches.kernel_args(cam_from_world)
         information, gradient, *_ = normal_equations(*arguments, inliers, CAUCHY_SCALE, 7)
         information[6, 6] += 1.0 / _LOG_FOCAL_SIGMA**2

@@ -11,24 +11,25 @@ from jaxtyping import Bool, Float, Int
 from topoloc.compiled import kernel
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.robust_variance import CAUCHY_SCALE, estimate_noise_scale
 
 _COLUMNS, _ROWS = 8, 6
 _Array = np.ndarray
 MIN_POINTS = 4
+CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
+_MAX_SCALE_STEPS = 30
 # Effect of Cauchy's weights w on Gaussian residuals r of two dimensions, to correct the covariance
-# for it: E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance over the inverse
-# of its information.
+# for it: E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance
+# over the inverse of its information.
+_MEAN_WEIGHTED_SQUARE = 0.6302
 _ESTIMATOR_VARIANCE = 0.8265
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMatches:
-    """Hold the usable matches: pixels with their standard deviation, their coordinates and
-    covariances on the plane z = 1, and world points."""
+    """Hold the usable matches: standard deviations of pixels, coordinates and covariances of pixels
+    on the plane z = 1, and world points."""
 
     sigma_px: float | Float[np.ndarray, " n"]
-    points_img: Float[np.ndarray, "n 2"]
     normalized: Float[np.ndarray, "n 2"]
     covariances: Float[np.ndarray, "n 2 2"]
     points_world: Float[np.ndarray, "n 3"]
@@ -53,7 +54,6 @@ class PoseMatches:
         variances = np.square(sigma_px)[..., None]
         return PoseMatches(
             sigma_px,
-            points_img=np.ascontiguousarray(points_img, dtype=np.float64),
             normalized=normalized,
             covariances=(variances * products).reshape(-1, 2, 2),
             points_world=np.ascontiguousarray(points_world, dtype=np.float64),
@@ -62,18 +62,14 @@ class PoseMatches:
 
     def kernel_args(self, cam_from_world: Rigid3) -> tuple[_Array, ...]:
         """Return the arguments that all kernels share."""
-        return (
-            np.ascontiguousarray(cam_from_world.rotation),
-            np.ascontiguousarray(cam_from_world.translation),
-            self.normalized,
-            self.covariances,
-            self.points_world,
-            self.point_covariances,
-        )
+        pose = np.ascontiguousarray(cam_from_world.rotation), cam_from_world.translation.copy()
+        points = self.points_world, self.point_covariances
+        return *pose, self.normalized, self.covariances, *points
 
     def can_fix_pose(self) -> bool:
         """Return whether neither the points nor their pixels lie on one line."""
-        return is_non_collinear(self.points_world) and is_non_collinear(self.normalized)
+        usable = np.ones(len(self.normalized), np.bool_)
+        return has_spread(self.points_world, usable) and has_spread(self.normalized, usable)
 
     def select_inliers(
         self, kernel_args: tuple[_Array, ...], max_error_px: float, max_scale: float = 1.0
@@ -113,19 +109,6 @@ class PoseMatches:
                 pose = (*run_gauss_newton(*pose, inliers, CAUCHY_SCALE, 10), *pose[2:])
         covariance = _estimate_covariance(pose, inliers, min_noise_scale)
         return None if covariance is None else (Rigid3(*pose[:2]), inliers, covariance)
-
-
-def refine_pose(
-    cam_from_world: Rigid3, matches: PoseMatches, active: Bool[np.ndarray, " n"]
-) -> Rigid3:
-    """Return the pose that fits the active matches best, starting from a nearby pose, in at most 10
-    steps."""
-    return Rigid3(*run_gauss_newton(*matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, 10))
-
-
-def is_non_collinear(points: Float[np.ndarray, "n d"]) -> bool:
-    """Return whether there are at least four points, not all on one line."""
-    return has_spread(points, np.ones(len(points), np.bool_))
 
 
 def _estimate_covariance(
@@ -175,6 +158,25 @@ def has_spread(points, active):
     # Of variances a <= b <= c, trace^2 - |scatter|^2 is 2 (ab + ac + bc), between 2 bc and 6 bc.
     total = np.trace(scatter) ** 2
     return total - np.sum(scatter * scatter) > 2e-9 * total
+
+
+@kernel(error_model="numpy")
+def estimate_noise_scale(squares, num_unknowns, least=1.0):
+    """Return the factor by which the noise exceeds its assumed standard deviation, from squared
+    whitened residuals (n) of a fit of some unknowns (Huber's proposal 2, 1964).
+
+    It is at least `least`. If few matches fit well, this is due to chance or to the fit itself.
+    """
+    num_free, variance = max(2 * len(squares) - num_unknowns, 1), 1.0
+    for _ in range(_MAX_SCALE_STEPS):
+        total = 0.0
+        for square in squares:
+            total += square / (variance + square / CAUCHY_SCALE**2)
+        better = max(least**2, variance * total / (_MEAN_WEIGHTED_SQUARE * num_free))
+        if abs(better / variance - 1.0) <= 0.001:
+            break
+        variance = better
+    return np.sqrt(variance)
 
 
 @kernel(error_model="numpy", inline="always")

@@ -30,8 +30,8 @@ from topoloc.geometry.joint_camera.joint_fit import (
     fit_camera,
     linearized_fit,
 )
+from topoloc.geometry.pose_matches import CAUCHY_SCALE
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.geometry.robust_variance import CAUCHY_SCALE
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.query import Deadline, QueryImage, unknown_camera

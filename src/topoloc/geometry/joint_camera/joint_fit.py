@@ -39,9 +39,8 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     WeighedCamera,
     map_variance,
 )
-from topoloc.geometry.pose_matches import cells_of
+from topoloc.geometry.pose_matches import CAUCHY_SCALE, cells_of, estimate_noise_scale
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.robust_variance import CAUCHY_SCALE, estimate_noise_scale
 
 _NUM_ROUNDS, _MIN_POINTS = 15, 8
 INTRINSICS, TURN = slice(6, 9), slice(14, 17)
