@@ -174,7 +174,7 @@ def test_a_probability_above_95_percent_has_sigmas_of_half_the_tolerance(
     metres: float, degrees: float
 ):
     variances = np.repeat([metres**2 / 3.0, np.deg2rad(degrees) ** 2 / 3.0], 3)
-    highest = highest_probability(np.diag(variances), EvidenceConfig())
+    highest = highest_probability(np.diag(variances), 2.0, EvidenceConfig())
     sigmas = 1.9599  # of a normal distribution with 5 % beyond
     assert (highest > 0.95) <= (sigmas * metres <= 0.25 and sigmas * degrees <= 2.0)
     assert highest > 0.99 or metres > 0.09 or degrees > 0.75, "it must not refuse everything"
@@ -183,4 +183,20 @@ def test_a_probability_above_95_percent_has_sigmas_of_half_the_tolerance(
 def test_an_upper_bound_of_the_error_refuses_no_pose():
     config = EvidenceConfig()
     variances = np.repeat([1.0, np.deg2rad(20.0) ** 2], 3)
-    assert highest_probability(np.diag(variances), config) == config.min_probability
+    assert highest_probability(np.diag(variances), 2.0, config) == config.min_probability
+
+
+@given(st.floats(1e-3, 1.0), st.floats(0.1, 100.0))
+def test_without_scale_the_highest_probability_has_no_unit(share: float, unit: float):
+    """The same pose and points in another unit."""
+    config = EvidenceConfig(is_relative=True)
+    rotation = np.repeat(np.deg2rad(0.1) ** 2 / 3.0, 3)
+
+    def of_unit(unit: float) -> float:
+        position = np.repeat((share * unit) ** 2 / 3.0, 3)
+        covariance = np.diag(np.concatenate([position, rotation]))
+        return highest_probability(covariance, 4.0 * unit, config)
+
+    assert of_unit(unit) == pytest.approx(of_unit(1.0))
+    # 1.96 sigmas of the tolerance, 5 % of the depth
+    assert (of_unit(1.0) > 0.95) == (share < 0.2 / 1.96) or abs(share - 0.2 / 1.96) < 1e-4

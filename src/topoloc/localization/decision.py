@@ -272,7 +272,8 @@ def check_threshold(query: MapQuery, answer: Answer) -> Finding | None:
     if pose is None:
         return None
     least = 0.0 if certified is None else certified.applied_min_probability
-    precise = highest_probability(pose.camera_covariance, config)
+    depth = math.inf if answer.best is None else answer.best.fit.median_depth
+    precise = highest_probability(pose.camera_covariance, depth, config)
     probability = min(pose.probability, precise, _highest_of_part(answer))
     if probability < least:
         text = f"probability {probability:.3g}, below the map's certified threshold"

@@ -66,13 +66,18 @@ def compute_normalized_uncertainty(
     return max(asked, min(fitted, _PRECISE_DOUBT))
 
 
-def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceConfig) -> float:
-    """Return the highest probability that agrees with a pose covariance (metres, radians).
+def highest_probability(
+    covariance: Float[np.ndarray, "6 6"], median_depth: float, config: EvidenceConfig
+) -> float:
+    """Return the highest probability that agrees with a pose covariance (metres, radians) and the
+    median distance (metres) of the seen points.
 
     It is that of a normal error within the tolerance. At least `min_probability`, for a lack of
     precision alone refuses no pose: rho is that of the worse parts of a map.
     """
     max_translation, max_rotation_deg = config.max_errors
+    if config.is_relative:
+        max_translation = compute_translation_tolerance(median_depth, config)
     metres, radians = standard_deviations(covariance)
     doubt = max(metres / max_translation, math.degrees(radians) / max_rotation_deg)
     return max(probability_within_tolerance(doubt), config.min_probability)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from msgspec import Struct
 from msgspec.structs import asdict
 
-from topoloc.errors import CalibrationError, ResultError
+from topoloc.errors import CalibrationError, MapError, ResultError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Count, Finite, Nanoseconds, OneLine, decode_json
@@ -99,6 +99,14 @@ class Provenance(OneLine):
     joint_from_cam: Rigid3 | None = None
     has_scale: bool = True
     query: str = field(default="", compare=False)
+
+    def require_scale(self, use: str) -> None:
+        """Raise MapError if lengths of the result are not metres, which `use` needs."""
+        if not self.has_scale:
+            raise MapError(
+                f"map {self.map_id} has no scale, but {use} needs metres: set it by `topoloc scale"
+                " MAP --distance IMAGE_A,IMAGE_B=3.2m`, or --tag METRES"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Return the provenance as keys of a result's JSON, without the image's name."""

@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,10 @@ from topoloc import Localization, Localizer, NotLocalized, StreamedPose, Tracker
 from topoloc.apps.cli import main
 from topoloc.apps.robots.map_to_odom import ContinuityGate, StreamPose
 from topoloc.apps.robots.mavlink import DroneLocalizer, choose_origin
+from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.provenance import Provenance
 from topoloc.mapping.build import BuildConfig
 
 _FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -81,6 +84,20 @@ def test_a_pose_that_does_not_continue_the_last_one_is_a_reset(
     assert set(later.values()) == {int(is_reset)}
     assert {resets for t_ns, resets in found.items() if t_ns < restart_ns} == {0}
     assert warnings == []
+
+
+def test_a_map_without_scale_sends_no_metres():
+    unscaled = Provenance("0123456789abcdef", has_scale=False)
+    with receiver() as heard:
+        drone = DroneLocalizer(f"udpout:127.0.0.1:{heard.getsockname()[1]}", print)
+        for number in range(4):
+            answer = _answer(10**8 * number, 0.1 * number)
+            answer = replace(answer, result=replace(answer.result, provenance=unscaled))
+            with pytest.raises(MapError, match=r"abcdef has no scale, but a drone needs metres"):
+                drone.take(answer)
+        found = received(heard)
+        drone.close()
+    assert found == []
 
 
 def test_positions_of_far_worlds_are_sent_relative_to_an_origin():

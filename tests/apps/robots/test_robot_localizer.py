@@ -16,7 +16,9 @@ from topoloc.apps.robots import robot_localizer
 from topoloc.apps.robots.config import RobotConfig
 from topoloc.apps.robots.robot_localizer import RobotLocalizer
 from topoloc.apps.robots.ros_node import RobotPublisher, RosNode
+from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoFrame
@@ -174,6 +176,18 @@ def test_map_to_odom_is_that_of_the_measured_poses(make: Callable[..., Robot]):
     expected = MAP_FROM_ODOM @ robot.base(4)
     assert np.allclose(poses[-1].matrix(), expected.matrix(), atol=1e-9)
     assert robot.warnings == []
+
+
+def test_a_map_without_scale_publishes_no_metres(make: Callable[..., Robot]):
+    robot = make()
+    pose = MAP_FROM_ODOM @ BASE_FROM_CAM
+    unscaled = Provenance("0123456789abcdef", has_scale=False)
+    result = Localization(pose, COVARIANCE, 1.0, NodeId(1), [], 0, 0, {}, provenance=unscaled)
+    for number in range(4):
+        with pytest.raises(MapError, match=r"abcdef has no scale, but a robot needs metres"):
+            robot.see(number, result=result)
+    assert robot.published.transforms == []
+    assert robot.published.poses == []
 
 
 def test_it_is_published_between_the_images_with_stamps_that_increase(make: Callable[..., Robot]):

@@ -222,8 +222,9 @@ class DroneLocalizer:
 
     def take(self, answer: StreamedPose) -> None:
         """Take the answer for an image. It is sent if it is measured, probable, and continues the
-        last pose or is confirmed."""
+        last pose or is confirmed. Raises MapError: it is of a map without scale."""
         min_probability, result = 0.8, answer.result
+        result.provenance.require_scale("a drone")
         self._gate.observe(answer)
         if not (isinstance(result, Localization) and answer.is_measured):
             return

@@ -103,7 +103,8 @@ class RobotLocalizer:
     def localize(
         self, frame: QueryFrame, tracker: Tracker, camera_of_size: CameraOfSize | None
     ) -> QueryAnswer:
-        """Localize the next image and publish its pose. Raises as `QueryFrame.localize`."""
+        """Localize the next image and publish its pose. Raises as `QueryFrame.localize`; MapError:
+        the map has no scale."""
         if frame.t_ns < self._last_ns:
             self._reset(frame.t_ns)
             tracker.reset()
@@ -118,6 +119,7 @@ class RobotLocalizer:
                 tracker.expect(*prior, frame.t_ns, odometry.odom_from_cam)
         answer = frame.localize(tracker.cameras, tracker, camera_of_size)
         if answer.streamed is not None:
+            answer.streamed.result.provenance.require_scale("a robot")
             self._report("image", _describe_image(answer.streamed))
             self._publish(answer.streamed, odometry)
         return answer
