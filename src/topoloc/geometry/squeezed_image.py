@@ -16,12 +16,15 @@ from jaxtyping import Float
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.camera import Camera, UncalibratedCamera
+from topoloc.geometry.pose_sampling import sample_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 
 _MIN_INLIERS, _WELL_EXPLAINED = 12, 0.98  # of the matches by square pixels: no ratio is searched
 _STEPS = (0.09, 0.03, 0.01)  # of the logarithm of the ratio
 _MAX_LOG_RATIO = 0.45
 _MIN_GAIN = 0.9  # of the errors; those of whole images fall less
+_WELL_CALIBRATED = 0.85  # of the matches by the calibration: no ratio is tried
+_TRIED_LOG_RATIO, _MIN_SIGMAS = 0.12, 3.0  # of the number of matches that another ratio explains
 _Found = tuple[AbsolutePose, Camera]
 
 
@@ -105,6 +108,33 @@ def estimate_pose_and_camera(
     if better is None:
         return found
     return _squeezed(matches.with_ratio_error(log_ratio, better), log_ratio, uncalibrated)
+
+
+def is_scaled_apart(
+    points_img: Float[np.ndarray, "n 2"],
+    points_world: Float[np.ndarray, "n 3"],
+    camera: Camera,
+    num_inliers: int,
+    config: AbsolutePoseConfig,
+) -> bool:
+    """Return whether a calibrated image had its width and height scaled apart: another ratio of fy
+    to fx explains evidently more of n matches, which were not guided by a pose. `num_inliers` of
+    them agree with the calibration."""
+    if not _MIN_INLIERS <= num_inliers < _WELL_CALIBRATED * len(points_img):
+        return False
+    pixels = camera.normalized_from_img(points_img) * [camera.fx, camera.fy]  # with any lens
+
+    def count(log_ratio: float) -> int:
+        sizes = camera.width, camera.height, camera.fx, camera.fy * math.exp(log_ratio), 0.0, 0.0
+        plain, sampling = Camera.pinhole(*sizes), config.sampling()
+        found = sample_absolute_pose(pixels, points_world, plain, sampling)
+        return 0 if found is None else found[1]
+
+    square, (narrow, wide) = count(0.0), [count(sign * _TRIED_LOG_RATIO) for sign in (-1.0, 1.0)]
+    best = max(narrow, wide)
+    if best > square:
+        best = max(best, count(2.0 * (_TRIED_LOG_RATIO if wide > narrow else -_TRIED_LOG_RATIO)))
+    return best - square > _MIN_SIGMAS * math.sqrt(max(square, 1))
 
 
 def _search_ratio(matches: _Matches, whole: _Found) -> tuple[float, _Found | None]:

@@ -27,7 +27,12 @@ from topoloc.localization.evidence import highest_probability
 from topoloc.localization.exact.appearance import check_colours
 from topoloc.localization.exact.last_step import refine_answer
 from topoloc.localization.exact.pixel_evidence import weigh_pixels
-from topoloc.localization.image_calibration_check import SeenCamera, check_image_calibration
+from topoloc.localization.image_calibration_check import (
+    SeenCamera,
+    check_image_calibration,
+    doubt_ratio,
+    shows_other_ratio,
+)
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import Deadline, QueryImage, StageClock
@@ -211,6 +216,10 @@ def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
         return None
     with search.query.clock.stage("calibration"):
         found = check_image_calibration(search, best.fit, best.evidence.is_of_nodes)
+        is_turning = found.other is not None and found.doubt is None
+        is_apart = not is_turning and shows_other_ratio(search)
+    if is_apart and (finding := _find_other_ratio(query, best)) is not None:
+        return finding
     facts: dict[str, Any] = {"seen_camera": found.seen}
     if found.other is None:
         return Finding("camera", "the image agrees with its calibration", facts=facts)
@@ -228,6 +237,27 @@ def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
         refusal = ("too_few_inliers", text)
     by_image = _with_camera(best, found.other)
     return Finding("camera", text, factor, facts, by_image, refusal=refusal)
+
+
+def _find_other_ratio(query: MapQuery, best: Hypothesis) -> Finding | None:
+    """Return the answer by a camera whose fy is not that of the calibration, as of an image whose
+    width and height were scaled apart after it was calibrated. None if it is not so."""
+    least = 0.02  # of the ratio, two of its standard deviations
+    other = query.without_calibration()
+    answer = other.search_all()
+    answer = answer.after(weigh_pixels(other, answer))
+    pose, found, calibrated = answer.pose, answer.best, best.fit.camera
+    text = "width and height of the image were scaled apart, unlike its calibration"
+    if pose is None or found is None:
+        return Finding("camera", text, refusal=("too_few_inliers", f"{text}: state --camera"))
+    seen = found.fit.camera
+    if abs(math.log(seen.fy / seen.fx * calibrated.fx / calibrated.fy)) < least:
+        return None
+    shift = found.fit.pose.cam_from_world @ best.fit.pose.cam_from_world.inverse()
+    doubt = doubt_ratio(calibrated, seen, shift, answer.search.query.scale)
+    pose = replace(pose, calibration_doubt=doubt)
+    poses = [(pose, answer.poses[0][1])]
+    return Finding("camera", text, answer=replace(answer, result=pose, poses=poses))
 
 
 def _share_without_pixels(query: MapQuery, best: Hypothesis, pose: Localization) -> float:

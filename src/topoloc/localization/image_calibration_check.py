@@ -44,6 +44,7 @@ from topoloc.geometry.joint_camera.joint_fit import (
     weigh_poses,
 )
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.squeezed_image import is_scaled_apart
 from topoloc.localization.pose_fit import PointObservations, PoseFit
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
@@ -220,6 +221,27 @@ def _is_better(other: JointFit, by_calibration: JointFit, camera: Camera) -> boo
     )
     counts = [(np.count_nonzero(before < px), np.count_nonzero(after < px)) for px in radii_px]
     return bool(sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts) >= min_gain)
+
+
+def shows_other_ratio(search: Search) -> bool:
+    """Return whether the first matches ask for another ratio of fy to fx."""
+    first = search.retrieved
+    if not isinstance(first, PoseFit) or not _has_enough(first):
+        return False
+    seen = first.match_observations
+    pixels = seen.points_img.astype(np.float64)
+    arguments = pixels, seen.points_world, first.camera, first.num_inliers
+    return is_scaled_apart(*arguments, search.config.pose)
+
+
+def doubt_ratio(
+    calibrated: Camera, seen: Camera, shift: Rigid3, scale: float
+) -> CalibrationMismatch:
+    """Return the mismatch of a calibration with the camera of an image whose width and height were
+    scaled apart. `shift` is from the pose by the calibration to that by `seen`."""
+    centres = _principal_point(seen, scale), _principal_point(calibrated, scale)
+    focals = seen.fy * scale, 0.01 * seen.fy * scale, calibrated.fy * scale  # fy
+    return CalibrationMismatch(*focals, *centres, ["focal_length"], shift.log())
 
 
 def find_focal_doubt(search: Search, fit: PoseFit) -> str:

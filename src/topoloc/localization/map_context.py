@@ -161,9 +161,11 @@ class MapContext:
     ) -> R:
         """Return the result with the map's identity, its geopose, the camera and the time
         (nanoseconds)."""
-        if isinstance(camera, UncalibratedCamera):
-            found = result.provenance.camera  # estimated with the pose
-            camera = None if found is None else found.rescaled(camera.width, camera.height)
+        found = result.provenance.camera  # estimated with the pose
+        if found is not None and camera is not None:
+            camera = found.rescaled(camera.width, camera.height)
+        elif isinstance(camera, UncalibratedCamera):
+            camera = None
         provenance = Provenance(
             self.map_id,
             self.topomap.version,

@@ -13,10 +13,11 @@ After the deadline only the proposal at hand is finished.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
 
+from topoloc.geometry.camera import UncalibratedCamera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.answer import Answer, lead
 from topoloc.localization.map_context import MapContext
@@ -107,6 +108,19 @@ class MapQuery:
         verify_all(first, more(first))
         confirmed = confirm_hypotheses(first, last)
         return confirmed if confirmed.poses else answer
+
+    def without_calibration(self) -> MapQuery:
+        """Return a query whose camera is unknown but for about its focal length. Features are not
+        extracted again."""
+        searches = list[Search]()
+        for one in self.searches:
+            camera = one.query.camera
+            guess = UncalibratedCamera.from_focal_guess(camera.width, camera.height, camera.fx)
+            query = replace(one.query, input_camera=replace(guess, mask=camera.mask))
+            first = Search(query, one.map, one.config, one.weights, one.correlated_error_share)
+            previous = searches[-1] if searches else None
+            searches.append(replace(first, previous=previous, is_last=one.is_last, trace=one.trace))
+        return MapQuery(self.opened, searches, self.prior)
 
     def _search_type(self, search: Search) -> Answer:
         """Verify the proposals of one feature type."""

@@ -62,7 +62,7 @@ def propose_first(search: Search, prior: Rigid3 | None) -> NodeProposal:
         rows = search.map.nearest(prior, search.config.num_candidates)
         search.ranked = [NodeScore(row, -float(distances[row])) for row in rows]  # by Eq. 1
         proposal = _propose_from_nodes(search, "prior", rows, least)
-    search.num_retrieved = proposal.fit.num_inliers
+    search.retrieved = proposal.fit
     return proposal
 
 

@@ -121,8 +121,8 @@ class Search:
     """True if no other feature type follows."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
-    num_retrieved: int = 0
-    """The number of inliers of the fit to the retrieved candidates."""
+    retrieved: PointMatches | None = None
+    """The fit to the retrieved candidates, whose matches no pose guided."""
     first: PointMatches | None = None
     """The first fit tried. It gives the reason if there is no hypothesis."""
     is_stopped: bool = False
@@ -142,6 +142,11 @@ class Search:
     def best(self) -> Hypothesis | None:
         """Return the likeliest hypothesis so far, even if its probability is low."""
         return self.belief.hypotheses[0] if self.belief.hypotheses else None
+
+    @property
+    def num_retrieved(self) -> int:
+        """Return the number of inliers of the fit to the retrieved candidates."""
+        return 0 if self.retrieved is None else self.retrieved.num_inliers
 
     @property
     def is_clear(self) -> bool:

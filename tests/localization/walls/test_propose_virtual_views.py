@@ -290,7 +290,7 @@ def test_nearest_parts_are_matched_before_whole_views_unless_nodes_agree(
     query_image = QueryImage(seen_on_the_way_back(seed)[0][0], WIDE)
     opened = Localizer(corridor_of_two_kinds()).context
     search = opened.searches(query_image, StageClock(), Deadline())[-1]
-    search.num_retrieved = num_retrieved
+    monkeypatch.setattr(Search, "num_retrieved", num_retrieved)
     assert bool(list(propose_virtual_views(search))) == (seed == 0)
     near = search.weights.walls.stop.near_tangent
     nearest = [] if num_retrieved else [near, near]
