@@ -176,6 +176,15 @@ def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
     return cv2.resize(cropped(image, side, side, side, side), size, interpolation=cv2.INTER_CUBIC)
 
 
+def scaled_apart(image: np.ndarray, camera: Camera, factor: float) -> Given:
+    """Return the image with its rows scaled, and the calibration as the whole image's width gives
+    it: only the principal point follows."""
+    height = round(factor * camera.height)
+    resized = cv2.resize(image, (camera.width, height), interpolation=cv2.INTER_AREA)
+    cy = (camera.cy + 0.5) * height / camera.height - 0.5
+    return resized, Camera.from_json(camera.to_json() | {"height": height, "cy": cy})
+
+
 def made_of(image: np.ndarray, camera: Camera) -> Iterator[tuple[str, Given]]:
     """Return each situation with the image and the camera that the caller states."""
 
@@ -199,6 +208,9 @@ def made_of(image: np.ndarray, camera: Camera) -> Iterator[tuple[str, Given]]:
     yield "fisheye, no calibration", of(through_fisheye(image, camera)[0])
     yield "panorama, no calibration", of(panorama(image, camera))
     yield "calibrated", (image, camera)
+    yield "rows x 0.8, calibrated by the width", scaled_apart(image, camera, 0.8)
+    yield "rows x 0.9, calibrated by the width", scaled_apart(image, camera, 0.9)
+    yield "rows x 1.25, calibrated by the width", scaled_apart(image, camera, 1.25)
     yield "calibrated, rolling shutter, 1 degree", (rolled(image, camera, 1.0), camera)
     yield "calibrated, rolling shutter, 2 degrees", (rolled(image, camera, 2.0), camera)
 
