@@ -31,14 +31,14 @@ from topoloc.localization.image_calibration_check import (
     SeenCamera,
     check_image_calibration,
     doubt_ratio,
-    shows_other_ratio,
+    find_ratio_doubt,
 )
 from topoloc.localization.map_query import MapQuery
 from topoloc.localization.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import find_best_case
 from topoloc.localization.result import Localization
-from topoloc.localization.search import Trace
+from topoloc.localization.search import Search, Trace
 from topoloc.localization.tiles.tiles import (
     Reach,
     TileAnswer,
@@ -211,15 +211,18 @@ def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
     If the image contradicts its calibration, or if the camera turned, the pose is by the camera
     that the image shows. Its uncertainty is added to the covariance and lowers the probability.
     """
+    with answer.search.query.clock.stage("calibration"):
+        found = _compare_camera(query, answer)
+    if found is not None and "frame_rotation_deg" in found.facts:  # it scales rows as well
+        return found
+    return _find_other_ratio(query, answer.search) or found
+
+
+def _compare_camera(query: MapQuery, answer: Answer) -> Finding | None:
     search, best, pose = answer.search, answer.best, answer.pose
     if pose is None or best is None or best.fit.pose.camera is not None:
         return None
-    with search.query.clock.stage("calibration"):
-        found = check_image_calibration(search, best.fit, best.evidence.is_of_nodes)
-        is_turning = found.other is not None and found.doubt is None
-        is_apart = not is_turning and shows_other_ratio(search)
-    if is_apart and (finding := _find_other_ratio(query, best)) is not None:
-        return finding
+    found = check_image_calibration(search, best.fit, best.evidence.is_of_nodes)
     facts: dict[str, Any] = {"seen_camera": found.seen}
     if found.other is None:
         return Finding("camera", "the image agrees with its calibration", facts=facts)
@@ -239,23 +242,25 @@ def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
     return Finding("camera", text, factor, facts, by_image, refusal=refusal)
 
 
-def _find_other_ratio(query: MapQuery, best: Hypothesis) -> Finding | None:
+def _find_other_ratio(query: MapQuery, search: Search) -> Finding | None:
     """Return the answer by a camera whose fy is not that of the calibration, as of an image whose
     width and height were scaled apart after it was calibrated. None if it is not so."""
     least = 0.02  # of the ratio, two of its standard deviations
+    by_calibration = find_ratio_doubt(search)
+    if by_calibration is None or search.query.deadline.is_past:
+        return None
     other = query.without_calibration()
     answer = other.search_all()
     answer = answer.after(weigh_pixels(other, answer))
-    pose, found, calibrated = answer.pose, answer.best, best.fit.camera
-    text = "width and height of the image were scaled apart, unlike its calibration"
-    if pose is None or found is None:
+    if answer.pose is None or answer.best is None:
+        text = "width and height of the image were scaled apart, unlike its calibration"
         return Finding("camera", text, refusal=("too_few_inliers", f"{text}: state --camera"))
-    seen = found.fit.camera
-    if abs(math.log(seen.fy / seen.fx * calibrated.fx / calibrated.fy)) < least:
+    fit, calibrated = answer.best.fit, by_calibration.camera
+    ratio = fit.camera.fy / fit.camera.fx * calibrated.fx / calibrated.fy
+    if abs(math.log(ratio)) < least:
         return None
-    shift = found.fit.pose.cam_from_world @ best.fit.pose.cam_from_world.inverse()
-    doubt = doubt_ratio(calibrated, seen, shift, answer.search.query.scale)
-    pose = replace(pose, calibration_doubt=doubt)
+    text = f"the image has {ratio:.2f} times the height that its calibration states"
+    pose = replace(answer.pose, calibration_doubt=doubt_ratio(search, by_calibration, fit))
     poses = [(pose, answer.poses[0][1])]
     return Finding("camera", text, answer=replace(answer, result=pose, poses=poses))
 

@@ -223,25 +223,31 @@ def _is_better(other: JointFit, by_calibration: JointFit, camera: Camera) -> boo
     return bool(sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts) >= min_gain)
 
 
-def shows_other_ratio(search: Search) -> bool:
-    """Return whether the first matches ask for another ratio of fy to fx."""
+def find_ratio_doubt(search: Search) -> PoseFit | None:
+    """Return the fit of the first matches if they ask for another ratio of fy to fx."""
     first = search.retrieved
     if not isinstance(first, PoseFit) or not _has_enough(first):
-        return False
+        return None
     seen = first.match_observations
     pixels = seen.points_img.astype(np.float64)
     arguments = pixels, seen.points_world, first.camera, first.num_inliers
-    return is_scaled_apart(*arguments, search.config.pose)
+    return first if is_scaled_apart(*arguments, search.config.pose) else None
 
 
-def doubt_ratio(
-    calibrated: Camera, seen: Camera, shift: Rigid3, scale: float
-) -> CalibrationMismatch:
+def doubt_ratio(search: Search, calibrated: PoseFit, found: PoseFit) -> CalibrationMismatch:
     """Return the mismatch of a calibration with the camera of an image whose width and height were
-    scaled apart. `shift` is from the pose by the calibration to that by `seen`."""
-    centres = _principal_point(seen, scale), _principal_point(calibrated, scale)
-    focals = seen.fy * scale, 0.01 * seen.fy * scale, calibrated.fy * scale  # fy
-    return CalibrationMismatch(*focals, *centres, ["focal_length"], shift.log())
+    scaled apart. Focal lengths are fy."""
+    scale, cameras = search.query.scale, (found.camera, calibrated.camera)
+    seen_px, calibrated_px = (one.fy * scale for one in cameras)
+    shift = found.pose.cam_from_world @ calibrated.pose.cam_from_world.inverse()
+    return CalibrationMismatch(
+        seen_px,
+        0.01 * seen_px,
+        calibrated_px,
+        *(_principal_point(one, scale) for one in cameras),
+        ["focal_length"],
+        shift.log(),
+    )
 
 
 def find_focal_doubt(search: Search, fit: PoseFit) -> str:
