@@ -9,8 +9,9 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera, UncalibratedCamera
+from topoloc.geometry.pose_sampling import sample_absolute_pose
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.squeezed_image import estimate_pose_and_camera
+from topoloc.geometry.squeezed_image import estimate_pose_and_camera, is_scaled_apart
 
 pytestmark = pytest.mark.usefixtures("solvers")
 
@@ -89,3 +90,15 @@ def test_nothing_is_found_among_wrong_matches():
         rng.permutation(pixels), points, camera, CONFIG, point_covariances=covariances
     )
     assert found is None or np.count_nonzero(found[0].inliers) < 30
+
+
+@pytest.mark.parametrize("ratio", [0.8, 0.9, 1.0, 1.12, 1.25])
+def test_first_matches_tell_that_rows_were_scaled_after_the_calibration(ratio: float):
+    for seed in range(3):
+        pixels, points, _, image = seen(ratio, seed)
+        centre = (image.width - 1) / 2, (image.height - 1) / 2
+        calibrated = Camera.pinhole(image.width, image.height, 500.0, 500.0, *centre)
+        found = sample_absolute_pose(pixels, points, calibrated, CONFIG.sampling())
+        assert found is not None
+        arguments = pixels, points, calibrated, found[1], CONFIG
+        assert is_scaled_apart(*arguments) == (ratio != 1.0), (seed, found[1])

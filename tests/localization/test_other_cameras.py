@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -200,3 +202,23 @@ def test_without_scale_the_highest_probability_has_no_unit(share: float, unit: f
     assert of_unit(unit) == pytest.approx(of_unit(1.0))
     # 1.96 sigmas of the tolerance, 5 % of the depth
     assert (of_unit(1.0) > 0.95) == (share < 0.2 / 1.96) or abs(share - 0.2 / 1.96) < 1e-4
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_an_image_whose_rows_were_scaled_after_its_calibration(factor: float, localizer: Localizer):
+    """The calibration is that of the width, as of clients that scale it by one side."""
+    camera, panels, num_right = CAMERA.rescaled(640, 480), room(), 0
+    height = round(480 * factor)
+    stated = Camera.pinhole(640, height, camera.fx, camera.fx, camera.cx, (height - 1) / 2)
+    for index in (2.5, 3.5, 4.5, 5.5, 7.5, 8.5):
+        picture, truth = render(panels, path_pose(index), camera)[0], path_pose(index)
+        result = localizer.localize(cv2.resize(picture, (640, height)), stated)
+        is_right = _is_right(result, truth, metres=0.1)
+        assert is_right or not isinstance(result, Localization) or result.probability < 0.6
+        num_right += is_right
+        doubt = getattr(result, "calibration_doubt", None)
+        if doubt is not None and abs(math.log(doubt.focal_length_px / camera.fx)) > 0.1:
+            assert doubt.focal_length_px == pytest.approx(factor * camera.fx, rel=0.03)
+            assert result.provenance.camera is not None
+            assert result.provenance.camera.fy == pytest.approx(doubt.focal_length_px)
+    assert num_right >= 4
