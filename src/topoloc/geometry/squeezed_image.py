@@ -23,7 +23,6 @@ _MIN_INLIERS, _WELL_EXPLAINED = 12, 0.98  # of the matches by square pixels: no 
 _STEPS = (0.09, 0.03, 0.01)  # of the logarithm of the ratio
 _MAX_LOG_RATIO = 0.45
 _MIN_GAIN = 0.9  # of the errors; those of whole images fall less
-_WELL_CALIBRATED = 0.85  # of the matches by the calibration: no ratio is tried
 _TRIED_LOG_RATIO, _MIN_SIGMAS = 0.12, 3.0  # of the number of matches that another ratio explains
 _Found = tuple[AbsolutePose, Camera]
 
@@ -114,14 +113,10 @@ def is_scaled_apart(
     points_img: Float[np.ndarray, "n 2"],
     points_world: Float[np.ndarray, "n 3"],
     camera: Camera,
-    num_inliers: int,
     config: AbsolutePoseConfig,
 ) -> bool:
     """Return whether a calibrated image had its width and height scaled apart: another ratio of fy
-    to fx explains evidently more of n matches, which were not guided by a pose. `num_inliers` of
-    them agree with the calibration."""
-    if not _MIN_INLIERS <= num_inliers < _WELL_CALIBRATED * len(points_img):
-        return False
+    to fx explains evidently more of n matches, which were not guided by a pose."""
     pixels = camera.normalized_from_img(points_img) * [camera.fx, camera.fy]  # with any lens
 
     def count(log_ratio: float) -> int:
@@ -134,7 +129,7 @@ def is_scaled_apart(
     best = max(narrow, wide)
     if best > square:
         best = max(best, count(2.0 * (_TRIED_LOG_RATIO if wide > narrow else -_TRIED_LOG_RATIO)))
-    return best - square > _MIN_SIGMAS * math.sqrt(max(square, 1))
+    return best - square > _MIN_SIGMAS * math.sqrt(max(square, _MIN_INLIERS))
 
 
 def _search_ratio(matches: _Matches, whole: _Found) -> tuple[float, _Found | None]:

@@ -225,28 +225,28 @@ def _is_better(other: JointFit, by_calibration: JointFit, camera: Camera) -> boo
 
 def find_ratio_doubt(search: Search) -> PoseFit | None:
     """Return the fit of the first matches if they ask for another ratio of fy to fx."""
-    first = search.retrieved
+    first, well_explained = search.retrieved, 0.85  # of the matches, by the calibration
     if not isinstance(first, PoseFit) or not _has_enough(first):
         return None
+    if first.num_inliers >= well_explained * len(first.matches):
+        return None
     seen = first.match_observations
-    pixels = seen.points_img.astype(np.float64)
-    arguments = pixels, seen.points_world, first.camera, first.num_inliers
+    arguments = seen.points_img.astype(np.float64), seen.points_world, first.camera
     return first if is_scaled_apart(*arguments, search.config.pose) else None
 
 
 def doubt_ratio(search: Search, calibrated: PoseFit, found: PoseFit) -> CalibrationMismatch:
     """Return the mismatch of a calibration with the camera of an image whose width and height were
     scaled apart. Focal lengths are fy."""
-    scale, cameras = search.query.scale, (found.camera, calibrated.camera)
-    seen_px, calibrated_px = (one.fy * scale for one in cameras)
-    shift = found.pose.cam_from_world @ calibrated.pose.cam_from_world.inverse()
+    scale, seen, stated = search.query.scale, found.camera, calibrated.camera
     return CalibrationMismatch(
-        seen_px,
-        0.01 * seen_px,
-        calibrated_px,
-        *(_principal_point(one, scale) for one in cameras),
+        seen.fy * scale,
+        0.01 * seen.fy * scale,
+        stated.fy * scale,
+        _principal_point(seen, scale),
+        _principal_point(stated, scale),
         ["focal_length"],
-        shift.log(),
+        (found.pose.cam_from_world @ calibrated.pose.cam_from_world.inverse()).log(),
     )
 
 
