@@ -118,6 +118,8 @@ def is_scaled_apart(
     """Return whether a calibrated image had its width and height scaled apart: another ratio of fy
     to fx explains evidently more of n matches, which were not guided by a pose."""
     pixels = camera.normalized_from_img(points_img) * [camera.fx, camera.fy]  # with any lens
+    has_ray = np.isfinite(pixels).all(axis=1)
+    pixels, points_world = pixels[has_ray], points_world[has_ray]
 
     def count(log_ratio: float) -> int:
         sizes = camera.width, camera.height, camera.fx, camera.fy * math.exp(log_ratio), 0.0, 0.0
