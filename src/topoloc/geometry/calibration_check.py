@@ -51,10 +51,10 @@ class CalibrationMismatch:
     """Compare the camera estimated from an image with the calibration, in pixels of the original
     image.
 
-    `of` names the deviating parts: "focal_length", "principal_point", or "distortion", whose amount
-    is not measured. `shift` is the left
-    perturbation (metres, radians) from the pose under the calibration to the pose under the
-    estimated camera.
+    `of` names the deviating parts: "focal_length", "principal_point", "distortion", whose amount is
+    not measured, or "height" of an image that was scaled in one direction: focal lengths are then
+    fy. `shift` is the left perturbation (metres, radians) from the pose under the calibration to
+    the pose under the estimated camera.
     """
 
     focal_length_px: NonNegative
@@ -67,6 +67,11 @@ class CalibrationMismatch:
 
     def __str__(self) -> str:
         parts = []
+        if "height" in self.of:
+            parts.append(
+                f"fy = {self.focal_length_px:.0f} +- {self.focal_sigma_px:.0f} px, the calibration"
+                f" {self.calibrated_focal_length_px:.0f}, as after scaling in one direction"
+            )
         if "focal_length" in self.of:
             measured = f"f = {self.focal_length_px:.0f} +- {max(self.focal_sigma_px, 0.5):.0f} px"
             parts.append(f"{measured}, the calibration {self.calibrated_focal_length_px:.0f}")

@@ -213,8 +213,8 @@ def check_camera(query: MapQuery, answer: Answer) -> Finding | None:
     """
     with answer.search.query.clock.stage("calibration"):
         found = _compare_camera(query, answer)
-    if found is not None and "frame_rotation_deg" in found.facts:  # it scales rows as well
-        return found
+    if found is not None and found.refusal is None and "frame_rotation_deg" in found.facts:
+        return found  # a turn scales rows as well
     return _find_other_ratio(query, answer.search) or found
 
 
@@ -260,7 +260,8 @@ def _find_other_ratio(query: MapQuery, search: Search) -> Finding | None:
     if abs(math.log(ratio)) < least:
         return None
     text = f"the image has {ratio:.2f} times the height that its calibration states"
-    pose = replace(answer.pose, calibration_doubt=doubt_ratio(search, by_calibration, fit))
+    doubt = doubt_ratio(search, by_calibration, fit)
+    pose = replace(answer.pose, calibration_doubt=doubt, focal_length_px=None)
     poses = [(pose, answer.poses[0][1])]
     return Finding("camera", text, answer=replace(answer, result=pose, poses=poses))
 

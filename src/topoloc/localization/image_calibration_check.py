@@ -245,7 +245,7 @@ def doubt_ratio(search: Search, calibrated: PoseFit, found: PoseFit) -> Calibrat
         stated.fy * scale,
         _principal_point(seen, scale),
         _principal_point(stated, scale),
-        ["focal_length"],
+        ["height"],
         (found.pose.cam_from_world @ calibrated.pose.cam_from_world.inverse()).log(),
     )
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import pytest
 
-from tiny_world import CAMERA
+from tiny_world import CAMERA, path_pose, render, room
 from topoloc.apps.cli import main
 
 
@@ -24,6 +25,26 @@ def test_a_wrong_focal_length_is_reported_once(
     measured = float(said.split("f = ")[1].split(" ")[0])
     assert measured == pytest.approx(CAMERA.fx, rel=0.015)
     assert f"the calibration {scale * CAMERA.fx:.1f}" in said
+
+
+def test_images_scaled_in_one_direction_are_reported_once(
+    room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    camera, height = CAMERA.rescaled(640, 480), 384
+    for index in (2.5, 3.5, 4.5, 5.5, 7.5):
+        picture = cv2.resize(render(room(), path_pose(index), camera)[0], (640, height))
+        cv2.imwrite(str(tmp_path / f"{index}.png"), picture)
+    stated = f"{camera.fx},{camera.fx},{camera.cx},{(height - 1) / 2}"
+    assert main(["localize", str(room_map), str(tmp_path), "--camera", stated]) == 0
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "not scaled as" in line]
+    measured = float(said.split("fy = ")[1].split(" ")[0])
+    assert measured == pytest.approx(0.8 * camera.fx, rel=0.03)
+    # the remedy that it names: the camera of these images
+    given = f"{camera.fx},{0.8 * camera.fx},{camera.cx},{(height - 1) / 2}"
+    assert main(["localize", str(room_map), str(tmp_path), "--camera", given]) == 0
+    seen = capsys.readouterr()
+    assert "not scaled as" not in seen.err
+    assert seen.out.count("p 0.9") + seen.out.count("p 1.0") >= 4
 
 
 def test_a_right_calibration_is_not_reported(

@@ -146,6 +146,14 @@ def report_calibrations(answers: list[QueryAnswer]) -> None:
     for verdict in check_camera_calibrations(answer.result for answer in answers):
         if verdict.is_contradicted:
             print_warning(str(verdict))
+    doubts = [(a.query, d) for a in answers if (d := a.result.calibration_doubt) is not None]
+    scaled = [(name, doubt) for name, doubt in doubts if "height" in doubt.of]
+    if scaled:
+        name, doubt = scaled[0]
+        print_warning(
+            f"{len(scaled)} of {len(answers)} images were not scaled as their calibration; {name}:"
+            f" {doubt}; give the camera of these images"
+        )
 
 
 def report_cameras(cameras: SharedCameras, path: str | None, stream: Any) -> None:
