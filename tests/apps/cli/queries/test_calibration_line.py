@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from tiny_world import CAMERA, path_pose, render, room
@@ -34,6 +35,7 @@ def test_images_scaled_in_one_direction_are_reported_once(
     for index in (2.5, 3.5, 4.5, 5.5, 7.5):
         picture = cv2.resize(render(room(), path_pose(index), camera)[0], (640, height))
         cv2.imwrite(str(tmp_path / f"{index}.png"), picture)
+    cv2.imwrite(str(tmp_path / "nothing.png"), np.zeros((height, 640), np.uint8))
     stated = f"{camera.fx},{camera.fx},{camera.cx},{(height - 1) / 2}"
     assert main(["localize", str(room_map), str(tmp_path), "--camera", stated]) == 0
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "not scaled as" in line]

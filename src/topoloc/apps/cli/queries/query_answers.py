@@ -146,8 +146,9 @@ def report_calibrations(answers: list[QueryAnswer]) -> None:
     for verdict in check_camera_calibrations(answer.result for answer in answers):
         if verdict.is_contradicted:
             print_warning(str(verdict))
-    doubts = [(a.query, d) for a in answers if (d := a.result.calibration_doubt) is not None]
-    scaled = [(name, doubt) for name, doubt in doubts if "height" in doubt.of]
+    found = [(a.query, a.result) for a in answers if isinstance(a.result, Localization)]
+    doubts = [(name, one.calibration_doubt) for name, one in found]
+    scaled = [(name, doubt) for name, doubt in doubts if doubt and "height" in doubt.of]
     if scaled:
         name, doubt = scaled[0]
         print_warning(
